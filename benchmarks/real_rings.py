@@ -296,11 +296,14 @@ def table_of_seeds(rings):
             values = [value for value in values if value is not None]
             return f"{how(values):.3g}" if values else "-"
 
+        def worst(key, before="", good=good, over=over):
+            return before + over(key, max) if len(good) > 1 else ""
+
         experts = good[0].get("experts")
         cells = [
             found[0]["ring"], over("in_plane", step=0), f"{experts[0]:.3g}" if experts else "",
-            f"{over('in_plane')} ({over('with_jump')})", over("in_plane", max), over("chi2"),
-            f"{over('coupling')} ({over('with_roll')})", f"{over('rf')} / {over('rf', max)}",
+            f"{over('in_plane')} ({over('with_jump')})", worst("in_plane"), over("chi2"),
+            f"{over('coupling')} ({over('with_roll')})", over("rf") + worst("rf", " / "),
             f"{np.median([one['seconds'] for one in good]):.0f}",
         ]  # fmt: skip
         yield f"| {' | '.join(cells)} |"

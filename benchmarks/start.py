@@ -76,7 +76,7 @@ def main():
         }
         for command in COMMANDS:
             arguments = [places.get(word, word) for word in command]
-            plain = [sys.executable, "-m", "tmlattice.cli", *arguments]
+            plain = [sys.executable, "-m", "tmlattice", *arguments]
             first, _ = timed(plain, environment)
             later = [timed(plain, environment) for _ in range(repeat)]
             timed([sys.executable, "-c", WATCHED, *arguments], environment)

@@ -112,14 +112,15 @@ def optics():
 
 def response():
     """A simulated orbit response of the small ring, gradients and gains wrong everywhere."""
+    from tmlattice.plots.diagnosis import drawn
     from tmlattice.plots.response import response_figures
 
     ring = tmlattice.load_ring(SMALL)
     fault = [Cause("quadrupole_gradient", "QD::5", -0.03)]
     errors = {"quadrupole_gradient": 2e-3, "monitor_gain_x": 0.02, "monitor_gain_y": 0.02}
     data = simulate_response(ring, fault, background=errors, noise=3e-7, progress=False).measured
-    for name, _, figure in response_figures(tmlattice.diagnose(ring, data)):
-        yield f"response-{name}", figure
+    for name, _, draw in response_figures(tmlattice.diagnose(ring, data)):
+        yield f"response-{name}", drawn(draw)
 
 
 def together():

@@ -36,6 +36,22 @@ def tmlattice(*arguments, cwd, check=None):
     return done
 
 
+def refused(*arguments, cwd, says):
+    """The command ends in one sentence that states this, and leaves its folder as it was."""
+
+    def found():
+        return {path: path.is_file() and path.read_bytes() for path in cwd.rglob("*")}
+
+    before = found()
+    done = tmlattice(*arguments, cwd=cwd, check=2)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("tmlattice: ")
+    assert says in line
+    assert "Traceback" not in line
+    assert done.stdout == ""
+    assert found() == before
+
+
 def python(*words, cwd, **environment):
     """`python WORDS` in a process of its own, with another environment; None takes a name out."""
     changed = {**os.environ, **environment}

@@ -6,18 +6,17 @@ import tempfile
 from pathlib import Path
 from unittest import mock
 
-import numpy as np
-import pytest
-from shared import SHORT
-
 os.environ.setdefault("MPLBACKEND", "Agg")
 if "PYTEST_XDIST_WORKER" in os.environ:  # one of several processes: a thread each, one cache
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is imported
 else:
     _kept = tempfile.TemporaryDirectory(prefix="tmlattice-tests-")
     os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
+import numpy as np
+import pytest
+from shared import SHORT
 
 LONGEST = "scenarios data_checks correction diagnosis cli readme report_page turns_amplitude"
 

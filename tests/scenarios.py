@@ -76,8 +76,6 @@ class Scenario:
     small: Mapping[str, float | None] | None = None
     """Small errors: effect -> rms."""
     ring: str = "small"
-    edits: tuple[tuple[str, str], ...] = ()
-    """Of the design's lattice file, which then is not that of the machine."""
     seed: int = 3
     made: Mapping[str, Any] | None = None
     """Options of the virtual machine."""
@@ -143,7 +141,7 @@ def run(own: Scenario) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            result = diagnose(ring_of(own.ring, own.edits), data, seed=own.seed, **options)
+            result = diagnose(ring_of(own.ring), data, seed=own.seed, **options)
     except TmlatticeError as error:
         answer |= {"verdict": "refused", "found": [], "faults": _unsaid(own, str(error))}
         if "refused" not in own.verdicts:
@@ -170,7 +168,7 @@ def run(own: Scenario) -> dict[str, Any]:
                 faults.append(f"{cause.effect} {cause.element}: {pulls[-1]:.1f} errors from it")
     if len(result.findings) > len(wanted) + own.others:
         faults.append(f"{len(result.findings)} findings, not {len(wanted)}")
-    if own.small and own.before is None and not own.edits and set(own.small) <= set(FITTED):
+    if own.small and own.before is None and set(own.small) <= set(FITTED):
         faults += _of_small_errors(own, result)
     text = result.report()
     if "nan" in re.split(r"[^a-z]+", text):
@@ -478,7 +476,6 @@ def defect(name: str, damage: Change, *says: str, **more: Any) -> Scenario:
 
 RESPONSES = (
     row("response: nothing", verdicts=NOTHING, lasts=True),
-    one("quadrupole_gradient", "QF::2", -0.02),
     one("quadrupole_gradient", "QF::2", -0.05),
     one("quadrupole_roll", "QD::4", 0.01),
     one("sextupole_offset_y", "sf::2", -3e-3),
@@ -509,17 +506,17 @@ RESPONSES = (
         lasts=True,
         fewer=None,
     ),
-    row("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, lasts=True),
+    row("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, **SLOW),
     *(
-        row(f"response, usual errors: none, {k}", seed=k, verdicts=SOUND, lasts=True, fewer=fewer)
-        for k, fewer in ((5, FITTED), (8, None), (11, None))
+        row(f"response, usual errors: none, {k}", seed=k, verdicts=SOUND, **SLOW)
+        for k in (5, 8, 11)
     ),
     usual("quadrupole_gradient", "QF::2", 0.03, fewer=None),
     usual("quadrupole_roll", "QD::4", 0.02),
-    usual("corrector_calibration", "v3", -2.0),
-    usual("corrector_calibration", "v2", -1.0, fewer=None, lasts=False),
+    usual("corrector_calibration", "v3", -2.0, fewer=None),
+    usual("corrector_calibration", "v2", -1.0, fewer=(*FITTED, "corrector_roll")),
     usual("corrector_roll", "v5", np.pi / 2, fewer=None),
-    usual("monitor_gain_y", "bpm::6", -2.0),
+    usual("monitor_gain_y", "bpm::6", -2.0, fewer=None),
     usual("monitor_gain_x", "end_1", -1.33, fewer=None),
     usual("monitor_swap", "end_6", 1.0),
     usual("family_gradient", "QD", -0.0235),
@@ -568,16 +565,6 @@ RESPONSES = (
         lasts=True,
         fewer=None,
     ),
-    row(
-        "response: a design 2 % off",
-        ring="both",
-        edits=(("k = 0.9", "k = 0.88"),),
-        small=GRADIENTS,
-        found=(),
-        verdicts=MANY,
-        lasts=True,
-        fewer=None,  # as quick in tests/test_response_forms.py
-    ),
 )
 
 DEFECTS = (
@@ -586,7 +573,7 @@ DEFECTS = (
     defect("two steps read too early", readings(lagging), "contradict"),
     defect("another kick in two steps", readings(other_kick), "v2", "v4"),
     defect("two steps are larger", larger_steps),
-    defect("a monitor resembles nothing", readings(random_monitor), "end_2"),
+    defect("a monitor resembles nothing", readings(random_monitor), "end_2", fewer=None),
     defect("a monitor is noisy", noisy_monitor(40), "end_2"),
     defect("a monitor is noisy across", readings(noisy_across), "end_2", fewer=None),
     defect("a monitor is silent", readings(silent), "end_2"),
@@ -613,7 +600,7 @@ DEFECTS = (
         for a, b, fewer in (
             ("v5", "v7", None),
             ("v4", "v10", None),
-            ("v4", "v5", FITTED),
+            ("v4", "v5", None),
             ("v0", "v14", None),
         )
     ),
@@ -661,7 +648,7 @@ DEFECTS = (
 
 def since(name: str, *causes: Cause, **more: Any) -> Scenario:
     """What changed between two responses of a machine with usual errors."""
-    return row(f"response, since: {name}", *causes, **{"lasts": True} | more)
+    return row(f"response, since: {name}", *causes, **SLOW | more)
 
 
 CHANGES = (
@@ -704,12 +691,16 @@ CHANGES = (
         Cause("family_gradient", "QF", -0.01),
         Cause("family_gradient", "QD", -0.016),
         verdicts=ANY,
-        lasts=True,
         damage=None,
     ),
     row("first turns, since: a magnet", Cause("quadrupole_gradient", "QD::5", -0.02), **SLOW),
     row("first turns, since: nothing", verdicts=NOTHING, **SLOW),
-    row("orbit, since: a kick", Cause("corrector_kick_x", "v6", 3e-5)),
+    row(
+        "orbit, since: a kick",
+        Cause("corrector_kick_x", "v6", 3e-5),
+        lasts=True,
+        fewer=("corrector_kick_y", "quadrupole_offset_x", "dipole_field", "monitor_gain_x"),
+    ),
 )
 
 TURNS = (
@@ -724,7 +715,10 @@ TURNS = (
     turned("monitor_gain_y", "bpm::6", -2.0),
     turned("monitor_swap", "end_6", 1.0),
     turned("monitor_offset_x", "end_6", 5e-4),
-    turned("quadrupole_gradient", "QD::5", -0.2, small=USUAL),
+    turned("sextupole_offset_x", "sf::3", 2e-3),
+    turned("skew_gradient", "QF::7", 0.02),
+    turned("insertion_device_focusing", "wig_1", 0.03),
+    turned("energy_offset", None, 1e-3),
     row(
         "first turns: two magnets",
         Cause("quadrupole_gradient", "QD::5", -0.05),
@@ -773,7 +767,7 @@ TURNS = (
     row("turns: a magnet", Cause("quadrupole_gradient", "QD::5", -0.01)),
     row("turns: a roll", Cause("quadrupole_roll", "QF::7", 0.02), **SLOW),
     row("turns: exchanged planes", Cause("monitor_swap", "end_1", 1.0)),
-    row("turns, usual errors: none", verdicts=SOUND),
+    row("turns, usual errors: none", verdicts=SOUND, **SLOW),
     row(
         "turns, y alone: a magnet",
         Cause("quadrupole_gradient", "QD::5", -0.01),
@@ -806,7 +800,7 @@ SCENARIOS = (*RESPONSES, *DEFECTS, *CHANGES, *TURNS)
 QUICK = tuple(
     own if not own.lasts else replace(own, options={**(own.options or {}), "effects": _few(own)})
     for own in SCENARIOS
-    if not own.lasts or (own.fewer is not None and own.before is None)
+    if not own.lasts or own.fewer is not None
 )
 """Those that last are run with few effects."""
 

@@ -48,6 +48,14 @@ def run_page(page, **names):
     return names
 
 
+def first_turns(ring, causes=(), **options):
+    """Four first turns of little noise."""
+    from tmlattice import simulate
+
+    made = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
+    return simulate(ring, list(causes), **made | options).measurement()
+
+
 def gradients(ring, rms, rng):
     """Gradient errors of all quadrupoles."""
     from tmlattice import Cause

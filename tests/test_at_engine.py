@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from ocelot.cpbd.elements import Solenoid, Undulator
 from places import THIN, kicked
+from scipy.linalg import block_diag, expm
 
 from tmlattice import TaylorNetwork, load_ring, off_momentum
 from tmlattice.effects import (
@@ -47,23 +48,13 @@ def exit_state(engine, launch=LAUNCH, **setting):
 
 
 def quadrupole(k, length):
-    """Textbook matrix of (x, px, y, py)."""
-    matrix = np.zeros((4, 4))
-    for plane, strength in ((0, k), (2, -k)):
-        root = np.sqrt(complex(strength))
-        phase = root * length
-        sine = length if strength == 0 else np.sin(phase) / root
-        matrix[plane : plane + 2, plane : plane + 2] = np.real(
-            [[np.cos(phase), sine], [-(root**2) * sine, np.cos(phase)]]
-        )
-    return matrix
+    """Matrix of (x, px, y, py): x'' = -k x, y'' = k y."""
+    return block_diag(*(expm([[0, length], [-own * length, 0]]) for own in (k, -k)))
 
 
 def block(x, y):
     """The horizontal part of x, and that of y as the vertical one."""
-    matrix = x.copy()
-    matrix[2:, 2:] = y[:2, :2]
-    return matrix
+    return block_diag(x[:2, :2], y[:2, :2])
 
 
 def thin(normal=0.0, skew=0.0):
@@ -84,12 +75,47 @@ WIGGLER = (  # 4 m with a vertical focusing of 0.0027 / m^2 and none in x
 QUADRUPOLE = "Quadrupole(l=0.7, k1=0.24, eid='it')"
 
 
-def test_quadrupole_gradient_and_its_setting_multiply(tmp_path):
-    engine = engine_of(tmp_path, QUADRUPOLE, ("quadrupole_gradient", -0.2))
-    expected = quadrupole(0.24 * 0.8, 0.7) @ LAUNCH[:4]
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
-    expected = quadrupole(0.24 * 0.8 * 1.05, 0.7) @ LAUNCH[:4]
-    np.testing.assert_allclose(exit_state(engine, k1_relative=0.05), expected, atol=1e-13)
+DRIFT = quadrupole(0, 0.01)
+HALF, WHOLE = (block(quadrupole(0, way), quadrupole(0.0027, way)) for way in (2.0, 4.0))
+AXES = np.array([[np.cos(0.02), np.sin(0.02)], [-np.sin(0.02), np.cos(0.02)]])
+TURNED = np.kron(AXES, np.eye(2))  # coordinates along the axes of a magnet turned from x towards y
+GRADIENTS = [("gradient_absolute", 0.02), ("skew_gradient", 0.01)]
+WAKE = np.eye(4)
+WAKE[3, 2] = 0.05
+
+
+@pytest.mark.parametrize(
+    ("element", "causes", "setting", "expected"),
+    [
+        (QUADRUPOLE, [("quadrupole_gradient", -0.2)], {}, quadrupole(0.24 * 0.8, 0.7)),
+        (QUADRUPOLE, [("quadrupole_gradient", -0.2)], {"k1_relative": 0.05},
+         quadrupole(0.24 * 0.8 * 1.05, 0.7)),
+        (QUADRUPOLE, [("quadrupole_roll", 0.02)], {}, TURNED.T @ quadrupole(0.24, 0.7) @ TURNED),
+        # a quadrupole turned from x towards y by 45 degrees pulls towards its axis x = y: k1s < 0
+        ("Quadrupole(l=0.02, k1=0.5, tilt=3.14159265358979/4, eid='it')", [], {},
+         DRIFT @ thin(skew=-0.01) @ DRIFT),
+        *(
+            (element, GRADIENTS, {}, half @ thin(0.02, 0.01) @ half)  # thin, at the middle
+            for element, half in (
+                (QUADRUPOLE, quadrupole(0.24, 0.35)),
+                ("Sextupole(l=0.3, k2=0.0, eid='it')", quadrupole(0, 0.15)),
+                ("Marker(eid='it')", np.eye(4)),
+                (WIGGLER, HALF),
+            )
+        ),
+        # at the entrance of a matrix element, whatever its name
+        (WIGGLER, [("insertion_device_focusing", 0.01)], {}, WHOLE @ thin(0.01)),
+        (WIGGLER.replace("'wig'", "'it'"), [("insertion_device_focusing", 0.01)], {},
+         WHOLE @ thin(0.01)),
+        # in the middle of a cavity
+        ("Cavity(l=0.6, freq=5e8, eid='it')", [("wake_kick_y", 0.05)], {},
+         quadrupole(0, 0.3) @ WAKE @ quadrupole(0, 0.3)),
+    ],
+)  # fmt: skip
+def test_linear_effects_are_their_matrices(tmp_path, element, causes, setting, expected):
+    engine = engine_of(tmp_path, element, *causes)
+    thick = 1e-9 if "tilt" in element else 1e-13  # the skew one is thin in the formula
+    np.testing.assert_allclose(exit_state(engine, **setting), expected @ LAUNCH[:4], atol=thick)
 
 
 def test_family_gradient_changes_every_member_and_no_other(small_ring):
@@ -118,56 +144,7 @@ def test_quadrupole_offset_is_that_of_its_centre(tmp_path):
     engine = engine_of(
         tmp_path, QUADRUPOLE, ("quadrupole_offset_x", offset[0]), ("quadrupole_offset_y", offset[2])
     )
-    body = quadrupole(0.24, 0.7)
-    expected = body @ (LAUNCH[:4] - offset) + offset
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
-    on_axis = exit_state(engine, np.zeros(6))
-    feed_down = 0.24 * 0.7 * offset * [1, 1, -1, 1]  # focusing pulls the beam to the centre
-    np.testing.assert_allclose(on_axis[[1, 3]], feed_down[[0, 2]], rtol=0.03)  # thick
-
-
-def test_quadrupole_roll_turns_x_towards_y(tmp_path):
-    angle = 0.02
-    engine = engine_of(tmp_path, QUADRUPOLE, ("quadrupole_roll", angle))
-    axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    seen = np.kron(axes, np.eye(2))  # coordinates along the turned magnet's axes
-    expected = seen.T @ quadrupole(0.24, 0.7) @ seen @ LAUNCH[:4]
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
-    kick = exit_state(engine, np.array([0, 0, 1e-3, 0, 0, 0]))[1]
-    np.testing.assert_allclose(kick, -2 * 0.24 * 0.7 * angle * 1e-3, rtol=0.03)
-
-
-def test_skew_quadrupole_is_one_turned_by_45_degrees(tmp_path):
-    engine = engine_of(tmp_path, "Quadrupole(l=0.02, k1=0.5, tilt=3.14159265358979/4, eid='it')")
-    drift = quadrupole(0, 0.01)
-    # a quadrupole turned from x towards y by 45 degrees pulls towards its axis x = y: k1s < 0
-    expected = drift @ thin(skew=-0.01) @ drift @ LAUNCH[:4]
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("element", "half"),
-    [
-        (QUADRUPOLE, quadrupole(0.24, 0.35)),
-        ("Sextupole(l=0.3, k2=0.0, eid='it')", quadrupole(0, 0.15)),
-        ("Marker(eid='it')", np.eye(4)),
-        (WIGGLER, block(quadrupole(0, 2.0), quadrupole(0.0027, 2.0))),
-    ],
-)
-def test_thin_gradients_sit_at_the_middle(tmp_path, element, half):
-    causes = ("gradient_absolute", 0.02), ("skew_gradient", 0.01)
-    engine = engine_of(tmp_path, element, *causes)
-    expected = half @ thin(0.02, 0.01) @ half @ LAUNCH[:4]
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", ["wig", "it"])
-def test_insertion_device_focuses_at_its_entrance(tmp_path, name):
-    """A matrix element does, whatever its name."""
-    element = WIGGLER.replace("'wig'", f"'{name}'")
-    engine = engine_of(tmp_path, element, ("insertion_device_focusing", 0.01))
-    whole = block(quadrupole(0, 4.0), quadrupole(0.0027, 4.0))
-    expected = whole @ thin(0.01) @ LAUNCH[:4]
+    expected = quadrupole(0.24, 0.7) @ (LAUNCH[:4] - offset) + offset
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
 
 
@@ -176,16 +153,7 @@ def test_thin_kicks_are_those_of_the_table(tmp_path, name):
     """What `sign` says: of a marker, or of a wiggler's entrance."""
     marker = "marker" in CATALOGUE[name].sits_on_text
     engine = engine_of(tmp_path, "Marker(eid='it')" if marker else WIGGLER, (name, 0.01))
-    body = np.eye(4) if marker else block(quadrupole(0, 4.0), quadrupole(0.0027, 4.0))
-    expected = body @ kicked(name, 0.01, LAUNCH)
-    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
-
-
-def test_a_wake_in_a_cavity_kicks_in_its_middle(tmp_path):
-    engine = engine_of(tmp_path, "Cavity(l=0.6, freq=5e8, eid='it')", ("wake_kick_y", 0.05))
-    kick = np.eye(4)
-    kick[3, 2] = 0.05
-    expected = quadrupole(0, 0.3) @ kick @ quadrupole(0, 0.3) @ LAUNCH[:4]
+    expected = (np.eye(4) if marker else WHOLE) @ kicked(name, 0.01, LAUNCH)
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
 
 
@@ -509,15 +477,9 @@ def test_momentum_of_at_and_ocelot():
     p = (gamma[1] - gamma[0]) / momentum[0]
     state = to_at([1e-3, 2e-3, 3e-3, 4e-3, 5e-3, p], 5e-3)
     np.testing.assert_allclose(from_at(state, 5e-3), [1e-3, 2e-3, 3e-3, 4e-3, 5e-3, p], rtol=1e-12)
-    expected = [
-        1e-3,
-        2e-3,
-        3e-3,
-        4e-3,
-        momentum[1] / momentum[0] - 1,
-        5e-3 * momentum[0] / gamma[0],
-    ]
-    np.testing.assert_allclose(state, expected, rtol=1e-9)
+    np.testing.assert_allclose(state[:4], [1e-3, 2e-3, 3e-3, 4e-3], rtol=1e-9)
+    delta, way = momentum[1] / momentum[0] - 1, 5e-3 * momentum[0] / gamma[0]
+    np.testing.assert_allclose(state[4:], [delta, way], rtol=1e-9)
     assert abs(state[4] / p - 1) > 1e-3
 
 

@@ -17,9 +17,10 @@ from tmlattice.challenge.kinds import Ruler, problem_of
 from tmlattice.challenge.oracle import evaluate, refitted
 from tmlattice.challenge.record import Places, exact, one_action
 from tmlattice.challenge.score import row_of
+from tmlattice.challenge.unknown import Unknown, clean_readings
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
-from tmlattice.machine import Machine
+from tmlattice.machine import Machine, draw_shots
 from tmlattice.machine.stored_beam import simulate_dispersion
 
 LATTICE = str(SMALL)
@@ -48,6 +49,17 @@ def blind(made, tmp_path_factory):
 def public(folder):
     files = [p for p in sorted((folder / "cases").rglob("*")) if p.is_file()]
     return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def test_a_fault_outside_the_catalogue_leaves_nothing_in_the_ring(small_ring):
+    """The ring remembers AT's elements, which all machines share."""
+    shots = draw_shots(small_ring, 2, seed=1)
+    healthy = clean_readings(Machine(small_ring), shots)
+    fault = Unknown(small_ring, "octupole", shots, healthy, np.random.default_rng(1))
+    first, second = (fault.readings(1e3) for _ in range(2))
+    assert np.abs(first - healthy).max() > 1e-7
+    assert (second == first).all()
+    assert (clean_readings(Machine(small_ring), shots) == healthy).all()
 
 
 def test_cases_are_those_of_the_seed_whatever_their_number(made, tmp_path):
@@ -158,8 +170,10 @@ def test_the_oracle_of_several_causes_is_given_the_others(tmp_path):
 
 
 # --- scores by hand ---
-def truth_of(*causes, snr=30.0):
-    return Truth("x", "A", causes, None, tuple(snr for _ in causes), snr, {}, 1e-3, 2e-5, 0, {}, {})
+def truth_of(*causes, background=(), alone=(), snr=30.0):
+    every = tuple(snr for _ in causes)
+    return Truth("x", "A", causes, None, every, snr, dict(background), 1e-3, 2e-5, 0, {}, {},
+                 dict(alone))  # fmt: skip
 
 
 def finding(*members, amount=0.1, sigma=0.01, s=None):
@@ -400,8 +414,8 @@ def test_signal_to_noise_of_a_kind_by_brute_force_with_at(small_ring):
 def test_what_no_stored_beam_survives_is_smaller_until_one_does(small_ring, tmp_path):
     """30 % of a quadrupole has no closed orbit here; it is drawn all the same."""
     make(
-        "T", 3, 2, tmp_path, lattice=LATTICE, effects=["quadrupole_gradient"], signal=(20, 30),
-        progress=False, shots=2,
+        "M", 3, 2, tmp_path, lattice=LATTICE, effects=["quadrupole_gradient"], signal=(20, 30),
+        progress=False, kinds=["dispersion", "tunes"],
     )  # fmt: skip
     for name in ("0000", "0001", "0002"):
         (cause,) = read_truth(tmp_path, name).causes
@@ -479,26 +493,12 @@ def test_a_cause_is_drawn_among_what_is_measured_of_the_case(monkeypatch, tmp_pa
 
 
 def test_what_many_find_where_one_does_not_by_hand(small_ring):
-    name = "QD::3"
-    right = {
-        "effect": "quadrupole_gradient", "element": name, "s": None, "amount": 0.1,
-        "amount_sigma": 0.01, "probability": 1.0, "mass": 1.0,
-        "credible_set": [{"effect": "quadrupole_gradient", "element": name, "probability": 1.0}],
-    }  # fmt: skip
-    truth = Truth(
-        "x", "M", (Cause("quadrupole_gradient", name, 0.1),), None, (30.0,), 30.0, {}, 0.0, 1.0, 0,
-        {}, {}, {"a": 1.0, "b": 2.0},
-    )  # fmt: skip
+    right = finding(("quadrupole_gradient", "QD::3", 1.0))
+    truth = truth_of(Cause("quadrupole_gradient", "QD::3", 0.1), alone={"a": 1.0, "b": 2.0})
+    found = {True: result_of(right), False: result_of(verdict="none")}
     rows = []
     for together, alone in ((True, True), (False, True), (True, False), (True, False)):
-        said = {
-            "verdict": "identified" if together else "none", "findings": [right] * together,
-            "gap": {"explained": None, "heldout": None}, "next_measurement": None, "seconds": 1.0,
-            "alone": {
-                "a": {"verdict": "none", "findings": []},
-                "b": {"verdict": "identified", "findings": [right] * alone},
-            },
-        }  # fmt: skip
+        said = found[together] | {"alone": {"a": found[False], "b": found[alone]}}
         rows.append(row_of(said, truth, None, None, Places(small_ring)))
         rows[-1] |= {"clean_before": None, "clean_after": None}
     told = summary(rows, "M")["together"]
@@ -507,16 +507,11 @@ def test_what_many_find_where_one_does_not_by_hand(small_ring):
 
 
 def test_small_errors_are_no_false_alarm_where_there_are_some(small_ring):
-    truth = Truth("x", "E", (), None, (), 0.0, {"quadrupole_gradient": 1e-3}, 0.0, 1.0, 0, {}, {})
-    said = {
-        "verdict": "distributed", "findings": [], "gap": {"explained": None, "heldout": None},
-        "next_measurement": None, "priors": {"quadrupole_gradient": 1e-3},
-    }  # fmt: skip
-    row = row_of(said, truth, None, None, Places(small_ring))
-    assert summary([row], "E")["false_alarms"]["share"] == 0.0
-    sound = Truth("x", "E", (), None, (), 0.0, {}, 0.0, 1.0, 0, {}, {})
-    row = row_of(said, sound, None, None, Places(small_ring))
-    assert summary([row], "E")["false_alarms"]["share"] == 1.0
+    errors = {"quadrupole_gradient": 1e-3}
+    said = result_of(verdict="distributed") | {"priors": errors}
+    for background, share in ((errors, 0.0), ({}, 1.0)):
+        row = row_of(said, truth_of(background=background), None, None, Places(small_ring))
+        assert summary([row], "E")["false_alarms"]["share"] == share
 
 
 def test_kinds_that_make_no_sense_are_a_sentence(tmp_path):
@@ -532,14 +527,12 @@ def test_kinds_that_make_no_sense_are_a_sentence(tmp_path):
 
 
 def test_the_command_makes_kinds(tmp_path):
-    tmlattice(
-        "dev", "challenge", "make", "E", "--kind", "tunes", "--cases", "2", "--out", "e",
-        "--lattice", LATTICE, cwd=tmp_path, check=0,
-    )  # fmt: skip
-    tmlattice(
-        "dev", "challenge", "run", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
-    )
-    told = tmlattice(
-        "dev", "challenge", "score", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
-    )
+    for words in (
+        ("make", "E", "--kind", "tunes", "--cases", "1", "--out", "e"),
+        ("run", "e", "--jobs", "1"),
+        ("score", "e", "--jobs", "1"),
+    ):
+        told = tmlattice(
+            "dev", "challenge", *words, "--lattice", LATTICE, cwd=tmp_path, check=0
+        )  # fmt: skip
     assert "false alarms" in told.stdout

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import tmlattice
+from command import refused, tmlattice
 from conftest import SMALL
 
 from tmlattice.effects import CATALOGUE, Cause
@@ -28,10 +28,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def left(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-
-
 def test_simulate_writes_the_folder_and_the_truth(folder, small_ring):
     code, text = run(
         *QUICK, "--effect", "quadrupole_gradient qd::5 -0.02", "--effect", "energy_offset 1e-4",
@@ -40,7 +36,9 @@ def test_simulate_writes_the_folder_and_the_truth(folder, small_ring):
         "--out", "day", "--truth", "truth.json",
     )  # fmt: skip
     assert code == 0, text
-    assert left(folder) == ["day", "day/measurement.json", "day/readings.csv", "truth.json"]
+    assert sorted(path.name for path in folder.rglob("*")) == [
+        "day", "measurement.json", "readings.csv", "truth.json"
+    ]  # fmt: skip
     for words in ("3 shots of 2 turn(s)", "noise 20 µm", "engine ocelot, seed 5",
                   "quadrupole_gradient", "QD::5", "background monitor_roll: rms 0.005 rad",
                   "background quadrupole_gradient: rms 0.002", "written: day/"):  # fmt: skip
@@ -55,7 +53,6 @@ def test_simulate_writes_the_folder_and_the_truth(folder, small_ring):
     assert [(e["effect"], e["element"], e["amount"]) for e in truth.effects] == [
         (c.effect, c.element, c.amount) for c in causes
     ]
-    assert (truth.seed, truth.background["machine_seed"]) == (5, 1)
 
 
 def test_simulate_measures_with_given_settings(folder):
@@ -114,12 +111,7 @@ def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(folder, arguments, 
                        ("kick", '[{"qd::5": {"kick": 1e-5}}]'),
                        ("unknown", '[{"v33": {"kick": 1e-5}}]')):  # fmt: skip
         (folder / f"{name}.json").write_text(text)
-    before = left(folder)
-    code, text = run(*QUICK, "--out", "day", *arguments)
-    assert code == 2, text
-    assert words in text
-    assert "\n" not in text.strip()
-    assert left(folder) == before
+    refused(*QUICK, "--out", "day", *arguments, cwd=folder, says=words)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")

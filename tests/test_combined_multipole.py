@@ -116,8 +116,6 @@ def test_half_and_half_is_the_whole(ring):
 
 
 def test_every_format_that_is_written_keeps_kinds_and_maps(ring, tmp_path):
-    from tmlattice.lattice.write import save_ring
-
     for name in ("ring.json", "ring.at.json", "ring.py"):
         save_ring(ring, tmp_path / name)
         again = load_ring(tmp_path / name)

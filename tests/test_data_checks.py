@@ -45,6 +45,14 @@ def steps(small_ring):
     return simulate_response(small_ring, background=errors, engine="ocelot", seed=1).measured
 
 
+@pytest.fixture(scope="module")
+def thomx():
+    """The ring and a response with the usual errors."""
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    return ring, steps
+
+
 def reported(checkup, status="wrong"):
     return [check for check in checkup.checks if check.status == status]
 
@@ -66,6 +74,9 @@ WRONG = {
     "monitors-shifted=1": lambda m: {"readings": shifted(m.readings, 1)},
     "x-shifted=-1": lambda m: {"readings": one_plane(m.readings, shifted(m.readings, -1), 0)},
     "monitors-backwards": lambda m: {"readings": m.readings[:, :, ::-1]},
+    "monitors-alphabetical": lambda m: {
+        "readings": m.readings[:, :, np.argsort(np.char.lower(m.monitors), kind="stable")]
+    },
     "launches-reversed": lambda m: {"launches": -m.launches},
     "slopes-reversed": lambda m: {"launches": m.launches * [1, -1, 1, -1, 1]},
     "launches-swapped": lambda m: {"launches": m.launches[:, [2, 3, 0, 1, 4]]},
@@ -113,10 +124,8 @@ def test_y_of_wrong_sign_is_named_with_its_mirror(small_ring, healthy):
     assert "--assume launches-y-reversed" in check.sentence
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_two_global_errors_are_named_together(small_ring, machine, stated):
-    data = replace(machine, readings=machine.readings * [-1e3, 1e3])
-    data = data if stated else replace(data, noise=None)
+def test_two_global_errors_are_named_together(small_ring, machine):
+    data = replace(machine, readings=machine.readings * [-1e3, 1e3], noise=None)
     found = {name for check in reported(check_data(small_ring, data)) for name in check.assume}
     assert found == {"readings-in-mm", "x-reversed"}
 
@@ -142,7 +151,6 @@ def test_a_beam_that_runs_backwards_is_told(small_ring, healthy):
 
 
 SICK = {
-    "no fault": ([], {}),
     "three monitors exchanged": (
         [Cause("monitor_swap", name, 1.0) for name in ("end_3", "end_4", "bpm::9")], {}),
     "another energy": ([Cause("energy_offset", None, 5e-3)], {}),
@@ -185,9 +193,6 @@ def test_a_beam_lost_in_a_ring_far_from_its_design_is_not_in_another_order():
     data = simulate(ring, background=rms, amplitude=3e-4, seed=3).measurement()
     assert np.isfinite(data.readings).mean() < 0.15
     assert [check.sentence for check in reported(check_data(ring, data))] == []
-    order = np.argsort(np.char.lower(data.monitors), kind="stable")
-    (check,) = reported(check_data(ring, replace(data, readings=data.readings[:, :, order])))
-    assert check.assume == ("monitors-alphabetical",)
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])
@@ -240,14 +245,6 @@ def test_small_errors_everywhere_are_not_taken_for_noise(small_ring):
     """Noise of 2 um, errors of hundreds: alike from shot to shot, or in proportion to the orbit."""
     data = simulate(small_ring, background={"all": None}, noise=2e-6, shots=6, seed=2)
     assert reported(check_data(small_ring, data.measurement())) == []
-
-
-def test_readings_that_follow_no_trajectory_are_of_another_lattice(small_ring, healthy, rng):
-    order = rng.permutation(len(healthy.monitors))
-    (check,) = reported(
-        check_data(small_ring, replace(healthy, readings=healthy.readings[:, :, order]))
-    )
-    assert (check.name, check.assume) == ("lattice", ())
 
 
 def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
@@ -384,7 +381,8 @@ def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):
     data = replace(machine, readings=machine.readings * [-1, 1])
     with pytest.raises(MeasurementError, match=r"x has the wrong sign.*--assume x-reversed"):
         diagnose(small_ring, data)
-    found = diagnose(small_ring, data, assume=["x-reversed"])
+    effects = ["quadrupole_gradient", "quadrupole_offset_x", "monitor_gain_x"]
+    found = diagnose(small_ring, data, assume=["x-reversed"], effects=effects)
     assert found.findings[0].element == FAULT.element
     assert found.as_json()["provenance"]["options"]["assume"] == ["x-reversed"]
 
@@ -634,7 +632,7 @@ def test_blocks_of_bpms_that_are_exchanged(small_ring, healthy, steps):
 
 
 @pytest.mark.parametrize(("plane", "factor"), [(0, 2.0), (1, 0.5)])
-def test_one_plane_of_another_size(small_ring, plane, factor):
+def test_one_plane_of_another_size(small_ring, thomx, plane, factor):
     """First turns of usual errors contradict the launches; a response contradicts the design."""
     turns = simulate(small_ring, background={"all": None}, shots=6, seed=3).measurement()
     times = np.where(np.arange(2) == plane, factor, 1.0)
@@ -642,8 +640,7 @@ def test_one_plane_of_another_size(small_ring, plane, factor):
     ratio, where = check.sentence.partition("being ")[2].split(" times these in ")
     assert (check.name, where[0]) == ("launches", "xy"[plane])
     assert float(ratio) == pytest.approx(factor, rel=0.2)
-    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
-    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    ring, steps = thomx
     assert reported(check_data(ring, steps)) == []
     for data in (
         replace(steps, response=times * steps.response),
@@ -666,9 +663,8 @@ def test_the_sign_of_a_plane_with_one_corrector(small_ring, steps):
     assert re.search(r"are -(0.9|1)\S* times the design's in x: ", check.sentence)
 
 
-def test_correctors_of_both_planes_in_another_order():
-    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
-    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+def test_correctors_of_both_planes_in_another_order(thomx):
+    ring, steps = thomx
     (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
     assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
 
@@ -717,11 +713,12 @@ def test_rounded_readings_have_a_larger_noise(small_ring, machine):
 
 
 def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):
-    """By chance another order explains the readings somewhat better."""
-    for seed in (1, 2):
+    """By chance another order explains those of seed 2 somewhat better."""
+    for seed, wrong in ((1, [("lattice", ())]), (2, [])):
         order = np.random.default_rng(seed).permutation(len(healthy.monitors))
         data = replace(healthy, readings=healthy.readings[:, :, order])
-        assert all(check.assume == () for check in reported(check_data(small_ring, data)))
+        checks = reported(check_data(small_ring, data))
+        assert [(check.name, check.assume) for check in checks] == wrong
 
 
 @pytest.mark.parametrize("factor", [1.01, 1e-6])

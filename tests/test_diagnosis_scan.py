@@ -165,7 +165,7 @@ def test_noise_is_estimated_within_five_percent_despite_a_strong_fault(petra3):
     base = Base(petra3, causes, noise=(3e-5, 1.5e-5))
     blind = base.data
     start = fit(base.problem, (), blind.launches)
-    assert estimate(blind, start.point.view) == pytest.approx([3e-5, 1.5e-5], rel=0.05)
+    assert estimate([(blind, start.point.view)]) == pytest.approx([3e-5, 1.5e-5], rel=0.05)
 
 
 def test_projection_takes_out_what_a_launch_can_do(base):

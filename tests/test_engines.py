@@ -27,10 +27,13 @@ def shots(petra3):
 
 @pytest.fixture(scope="module")
 def orbits(petra3, shots):
-    return {
-        engine: Machine(petra3, engine=engine).beam(shots.launches, 1, shots.settings)
-        for engine in ("at", "ocelot")
-    }
+    return both(petra3, shots.launches, settings=shots.settings)
+
+
+def both(ring, launches, turns=1, causes=(), settings=None):
+    """Beams of the two engines."""
+    return [Machine(ring, causes, engine=engine).beam(launches, turns, settings)
+            for engine in ("at", "ocelot")]  # fmt: skip
 
 
 ON_THE_BEAM = [n for n, effect in CATALOGUE.items() if not isinstance(effect, ReadingEffect)]
@@ -42,10 +45,7 @@ def test_change_of_the_orbit_is_the_same_in_both_engines(petra3, shots, orbits, 
     amount = effect.background or effect.largest / 10
     for place in PLACES[name]:
         causes = [Cause(name, place, amount)]
-        at, ocelot = (
-            Machine(petra3, causes, engine=engine).beam(shots.launches, 1, shots.settings) - before
-            for engine, before in orbits.items()
-        )
+        at, ocelot = np.subtract(both(petra3, shots.launches, 1, causes, shots.settings), orbits)
         size = np.sqrt((at**2).mean())
         assert size > 1e-9
         error = np.sqrt(((at - ocelot) ** 2).mean()) / size
@@ -69,14 +69,11 @@ def test_a_set_gradient_of_a_bend_is_the_same_in_both_engines(small_ring):
     ring = small_ring.with_changed("bend::3", k1=-0.05)
     setting = {"bend::3": {"k1_relative": 0.1}}
     shots = draw_shots(ring, 2, 1e-3, seed=3)
-    changes = {}
-    for engine in ("at", "ocelot"):
-        machine = Machine(ring, engine=engine)
-        there = machine.beam(shots.launches, 1, [setting] * 2)
-        changes[engine] = there - machine.beam(shots.launches)
-    size = np.sqrt((changes["at"] ** 2).mean())
+    there = both(ring, shots.launches, settings=[setting] * 2)
+    at, ocelot = np.subtract(there, both(ring, shots.launches))
+    size = np.sqrt((at**2).mean())
     assert size > 1e-5
-    assert np.sqrt(((changes["at"] - changes["ocelot"]) ** 2).mean()) < 0.02 * size
+    assert np.sqrt(((at - ocelot) ** 2).mean()) < 0.02 * size
 
 
 def test_a_matrix_that_kicks_does_so_in_both_engines():
@@ -85,9 +82,7 @@ def test_a_matrix_that_kicks_does_so_in_both_engines():
     ring = ring_of("small", (("root = sqrt", kick),))
     launches = np.zeros((1, 6))
     for causes in ([], [Cause("insertion_device_focusing", "wig_1", 0.5)]):
-        at, ocelot = (
-            Machine(ring, causes, engine=engine).beam(launches, 2) for engine in ("at", "ocelot")
-        )
+        at, ocelot = both(ring, launches, 2, causes)
         assert np.abs(ocelot).max() > 1e-4
         np.testing.assert_allclose(at, ocelot, rtol=0, atol=1e-8)  # sextupoles, to third order
 
@@ -145,7 +140,7 @@ def test_a_first_turn_of_millimetres_follows_at_through_strong_sextupoles():
     launches[:, :4] = [(1.5e-3, 0, 1e-3, 0), (-1e-3, 1e-4, 5e-4, 2e-4)]
     causes = [Cause("sextupole_offset_x", e.name, 5e-4) for e in ring.magnets
               if e.kind == "sextupole"][:9]  # fmt: skip
-    at, ocelot = (Machine(ring, causes, engine=e).beam(launches)[:, 0] for e in ("at", "ocelot"))
+    at, ocelot = (beam[:, 0] for beam in both(ring, launches, causes=causes))
     second = TaylorNetwork.from_ring(apply(ring, causes), 6).readings(launches)
     lacks = np.sqrt(((at - second) ** 2).mean())
     assert lacks > 2e-5
@@ -163,9 +158,7 @@ def test_a_rolled_bend_with_a_gradient_kicks_alike_in_both_engines(small_ring):
     """The kick is spread over the body, which focuses it: by 3 % here."""
     bend = small_ring["bend::3"]
     ring = small_ring.with_changed("bend::3", k1=-0.7 / bend.length**2)
-    causes, launches = [Cause("dipole_roll", "bend::3", 1e-3)], np.zeros((1, 6))
-    at, ocelot = (
-        Machine(ring, causes, engine=e).beam(launches)[0, 0, :, 1] for e in ("at", "ocelot")
-    )
+    rolled = both(ring, np.zeros((1, 6)), causes=[Cause("dipole_roll", "bend::3", 1e-3)])
+    at, ocelot = (beam[0, 0, :, 1] for beam in rolled)
     assert np.abs(at).max() > 1e-4
     np.testing.assert_allclose(ocelot, at, atol=2e-3 * np.abs(at).max())

@@ -24,7 +24,7 @@ from tmlattice.harmonics import frequency
 from tmlattice.importers import Options, bring_in, write_imported
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.mat_file import read_mat
-from tmlattice.measurement import Measurement, TurnByTurn
+from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import lines
 from tmlattice.report.plain import report_text
 
@@ -141,6 +141,15 @@ def design(found):
     return columns, model.rf_change(data.rf.step / data.rf.frequency)[at_monitor]
 
 
+def with_fit(variables, values, **parameter):
+    """With a fit whose iterations gave the gradient of the first QF these values, in 1/m²."""
+    first = next(i for i, f in enumerate(variables["RINGData"]["Lattice"]) if f["FamName"] == "QF")
+    moved = {"ElemIndex": first + 1.0, "FieldName": "PolynomB", "FieldIndex": np.array([1, 2.0])}
+    steps = [{"Params": np.array([moved | parameter], dtype=object), "Values": np.array([value])}
+             for value in values]  # fmt: skip
+    return {**variables, "FitParameters": np.array(steps, dtype=object)}
+
+
 @pytest.fixture
 def brought(tmp_path):
     def bring(variables, **options):
@@ -255,15 +264,7 @@ def test_frequency_or_momentum_is_told_by_the_data(simulated, brought):
 
 def test_lattice_before_the_fit(simulated, brought, tmp_path):
     """FitParameters hold the values of every iteration; the lattice has the last ones'."""
-    first = next(i for i, f in enumerate(elements()) if f["FamName"] == "QF")
-    parameter = {
-        "ElemIndex": first + 1.0,
-        "FieldName": "PolynomB",
-        "FieldIndex": np.array([1, 2.0]),
-    }
-    steps = [{"Params": np.array([parameter], dtype=object), "Values": np.array([value])}
-             for value in (0.9, 1.0)]  # fmt: skip
-    variables = {**simulated, "FitParameters": np.array(steps, dtype=object)}
+    variables = with_fit(simulated, (0.9, 1.0))
     fitted = brought(variables, iteration="last").ring
     assert (fitted["qf::0"].k1, fitted.model) == (pytest.approx(1.0), "fitted lattice")
     found = brought(variables)
@@ -279,9 +280,7 @@ def test_lattice_before_the_fit(simulated, brought, tmp_path):
     heads = [line for line in report_text(told).splitlines() if ring.model in line]
     assert {line.split(ring.model)[0].strip() for line in heads} >= {"readings less model, rms"}
     assert not any("design " in line and "found" in line for line in report_text(told).splitlines())
-    steps[1]["Values"] = np.array([1.1])  # not what the lattice has
-    variables["FitParameters"] = np.array(steps, dtype=object)
-    found = brought(variables)
+    found = brought(with_fit(simulated, (0.9, 1.1)))  # the last is not what the lattice has
     assert (found.ring["qf::0"].k1, found.ring.model) == (pytest.approx(1.0), "lattice of the file")
     assert any("those of no iteration of the fit" in s for s in found.assumed)
 
@@ -323,9 +322,8 @@ def one(array, value, place=1):
 
 def test_parameters_of_no_place_are_not_followed(simulated, brought):
     """Counted from 1; place 0 would be the last element."""
-    moved = {"ElemIndex": 0.0, "FieldName": "Length", "FieldIndex": np.array([1.0])}
-    steps = [{"Params": np.array([moved], dtype=object), "Values": np.array([0.0])}] * 2
-    variables = {**simulated, "FitParameters": np.array(steps, dtype=object)}
+    length = {"FieldName": "Length", "FieldIndex": np.array([1.0])}
+    variables = with_fit(simulated, (0.0, 0.0), ElemIndex=0.0, **length)
     found = brought(variables, iteration="first")
     assert any("cannot be followed" in sentence for sentence in found.assumed)
 
@@ -376,15 +374,11 @@ WRONG = {
     "no orbit change": (
         lambda v: {"LocoMeasData_M": np.nan * v["LocoMeasData"]["M"]}, "no corrector's orbit"),
     "a magnet of negative length": (
-        lambda v: {"RINGData_Lattice": np.array(
-            [{**e, "Length": -e["Length"]} if e["FamName"] == "QF" else e
-             for e in v["RINGData"]["Lattice"]], dtype=object)}, "has the negative length -0.4 m"),
+        lambda v: {"RINGData_Lattice": element(1, Length=-0.4)}, "has the negative length -0.4 m"),
     "an RF without bounds": (lambda v: {"LocoMeasData_RF": 9e299}, "cannot be"),
     "a harmonic without bounds": (lambda v: {"RINGData_CavityHarmNumber": 1e299}, "cannot be"),
     "an order of a field that would fill the memory": (
-        lambda v: {"RINGData_Lattice": np.array(
-            [{**e, "MaxOrder": 1e9} if e["FamName"] == "QF" else e
-             for e in v["RINGData"]["Lattice"]], dtype=object)}, "MaxOrder 1e"),
+        lambda v: {"RINGData_Lattice": element(1, MaxOrder=1e9)}, "MaxOrder 1e"),
     "M of another shape": (
         lambda v: {"LocoMeasData_M": np.zeros((3, 4))}, "LocoMeasData.M has the shape [3, 4]"),
     "beyond the lattice's": (
@@ -418,20 +412,6 @@ def test_variables_that_are_wrong_are_refused_in_one_sentence(simulated, brought
 def test_missing_variable_is_named(simulated, brought, name):
     with pytest.raises(TmlatticeError, match=name):
         brought({key: value for key, value in simulated.items() if key != name})
-
-
-def test_damaged_mat_files_are_a_sentence(simulated, tmp_path):
-    path = tmp_path / "a.mat"
-    path.write_bytes(b"no MATLAB file at all")
-    with pytest.raises(LatticeError, match="cannot be read as a MATLAB file"):
-        read_mat(path)
-    with pytest.raises(LatticeError, match="No such file"):
-        read_mat(tmp_path / "nothing.mat")
-    scipy.io.savemat(path, simulated)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(LatticeError, match=str(path)):
-        read_mat(path)
 
 
 def save_as_hdf5(path, variables):
@@ -491,6 +471,11 @@ def esrf(simulated, tmp_path_factory):
         file["input_names"] = names
         file["raw_up"], file["raw_down"] = 3e-4 + M / 2, 3e-4 - M / 2
         file["bipolar"] = True
+    (place / "cut.h5").write_bytes((place / "orm.h5").read_bytes()[:900])
+    shutil.copy(place / "orm.h5", place / "two_sizes.h5")
+    with h5py.File(place / "two_sizes.h5", "r+") as file:
+        del file["raw_down"]
+        file["raw_down"] = np.zeros((31, 32))
     with h5py.File(place / "eta.h5", "w") as file:
         x, y = 1e-3 * data["Eta"].reshape(2, -1)
         file["measured_eta_x"], file["measured_eta_y"] = x, y
@@ -539,27 +524,13 @@ def test_hdf5_files_of_the_esrf(simulated, esrf):
         (("names.json",), "no measurement that is known"),
         (("ring.mat",), "no measurement that is known"),
         (("orm.h5", "names.json", "nothing.mat"), "No such file"),
+        (("cut.h5", "names.json", "ring.mat"), "cannot be read as HDF5"),
+        (("two_sizes.h5", "names.json", "ring.mat"), "raw_down has the shape"),
     ],
 )
-def test_parts_that_are_missing_are_named(esrf, parts, told):
+def test_parts_that_are_missing_or_damaged_are_named(esrf, parts, told):
     with pytest.raises(TmlatticeError, match=told):
         bring_in([esrf / name for name in parts])
-
-
-def test_damaged_hdf5_is_a_sentence(esrf, tmp_path):
-    (tmp_path / "orm.h5").write_bytes((esrf / "orm.h5").read_bytes()[:900])
-    with pytest.raises(TmlatticeError, match="cannot be read as HDF5"):
-        bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
-
-
-def test_orbits_up_and_down_of_two_sizes_are_rejected(esrf, tmp_path):
-    shutil.copy(esrf / "orm.h5", tmp_path)
-    with h5py.File(tmp_path / "orm.h5", "r+") as file:
-        down = file["raw_down"][:-1]
-        del file["raw_down"]
-        file["raw_down"] = down
-    with pytest.raises(MeasurementError, match="raw_down has the shape"):
-        bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
 
 
 def middle_layer(variables):
@@ -726,8 +697,6 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     names = ["bpm::0", "bpm::5", "bpm::6"]
     x, y = (pd.DataFrame(turns[..., p].T, index=names) for p in range(2))
     tbt.write(tmp_path / "a.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
-    few = tbt.TbtData([tbt.TransverseData(X=x.iloc[:, :15], Y=y.iloc[:, :15])], 15)
-    tbt.write(tmp_path / "few.sdds", few, datatype="lhc")
     done = tmlattice("import", "a.sdds", "--lattice", lattice[0], "--out", "m", cwd=tmp_path,
                      check=0)  # fmt: skip
     assert "readings are in mm" in done.stdout
@@ -736,9 +705,6 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     assert_allclose(data.readings[0], 1e-3 * turns, rtol=1e-6)
     assert isinstance(data, TurnByTurn)
     assert "20 turns are those of a stored beam" in done.stdout
-    few = bring_in([tmp_path / "few.sdds"], Options(lattice=lattice[0])).measurement
-    assert isinstance(few, Measurement)  # 15 turns have no line
-    assert np.isinf(few.launch_sigma[0, :4]).all()
     x, y = (frame.rename(index={"bpm::5": "BPM.OF.ANOTHER"}) for frame in (x, y))
     tbt.write(tmp_path / "c.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
     found = bring_in([tmp_path / "c.sdds"], Options(lattice=lattice[0]))
@@ -808,15 +774,6 @@ def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
     doubts = " ".join(found.doubts)
     assert ("computed" in doubts) == name.startswith("siam")
     assert not any(word in doubts for word in ("assume", "momentum", "is not that of"))
-
-
-def test_noise_of_a_loco_file_is_that_of_two_orbits():
-    """The Middle Layer's own file of the same day has the scatter of one orbit."""
-    name = "lnls_2014-07-17_before"
-    loco = read_mat(measured_data("real_rings", f"{name}.loco.mat"))["LocoMeasData"]
-    orbit = read_mat(measured_data("real_rings", f"{name}.bpm.mat"))
-    one = np.concatenate([orbit["BPMxData"]["Sigma"], orbit["BPMyData"]["Sigma"]])
-    assert_allclose(loco["BPMSTD"], np.sqrt(2) * one, rtol=1e-9)
 
 
 def test_middle_layers_files_of_a_real_ring_are_its_loco_file():

@@ -14,7 +14,7 @@ from turn_by_turn import TbtData, TransverseData
 from tmlattice.errors import LatticeError, MeasurementError
 from tmlattice.importers.columns import read_columns
 from tmlattice.importers.hdf5 import read_hdf5, read_mapping
-from tmlattice.input_files import json_of, yaml_of
+from tmlattice.input_files import check_shape, json_of, yaml_of
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import read_turn_by_turn
 from tmlattice.observe.calibration import read_calibration
@@ -68,6 +68,12 @@ def virtual(file, folder):
     layout[:] = h5py.VirtualSource(folder / "other.h5", "x", (4, 6))
     del file["x"]
     file.create_virtual_dataset("x", layout)
+
+
+def many_states(file, folder):
+    """Each of them is small; none was written."""
+    for number in range(6):
+        file.create_dataset(f"bpm{number} y", (200_000,), "f8", fillvalue=np.nan)
 
 
 def not_utf8(file, folder):
@@ -144,6 +150,7 @@ HALF = {
     "virtual": (virtual, "'x' are in another file"),
     "a name that is not UTF-8": (not_utf8, "not UTF-8"),
     "a group in itself": (in_itself, "stands in itself"),
+    "many data sets": (many_states, "its data sets state"),
     "a bomb": (replaced(shape=(40_000_000, 6), dtype="f8", chunks=True), "state 1920 MB"),
     "a chunk": (replaced(shape=(4, 6), maxshape=(None, 6), dtype="f8", chunks=(10**6, 6)),
                 "state 48 MB"),
@@ -220,31 +227,37 @@ def test_cells_and_links_of_matlab_7_3_are_bounded(tmp_path, fill, words):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("read", "text", "words"),
     [
-        ("a: &a [x]\nnames: *a", "an alias"),
-        ("names: " + "[" * 500, "too deep"),
-        ("unit: mm\nunit: m", "stands twice"),
-        ("names: {a: b, a: c}", "stands twice"),
-        ("? [a, b]\n: c", "a key is a text"),
-        ("a: [1", "is no YAML"),
+        (yaml_of, "a: &a [x]\nnames: *a", "an alias"),
+        (yaml_of, "names: &a {x: y}\nbad: [*a]", "an alias"),
+        (yaml_of, "names: {x: &a [*a]}", "an alias"),
+        (yaml_of, "names: " + "[" * 500, "too deep"),
+        (yaml_of, "unit: mm\nunit: m", "stands twice"),
+        (yaml_of, "names: {a: b, a: c}", "stands twice"),
+        (yaml_of, "? [a, b]\n: c", "a key is a text"),
+        (yaml_of, "a: [1", "is no YAML"),
+        (json_of, '{"a": 1, "a": 2}', "stands twice"),
+        *((json_of, text, "a.text") for text in ("[" * 10**5, "1" * 5000, '{"a": NaN}', "{")),
     ],
 )
-def test_yaml_that_is_none_is_one_sentence(tmp_path, text, words):
-    path = tmp_path / "a.yaml"
+def test_text_that_is_no_document_is_one_sentence(tmp_path, read, text, words):
+    path = tmp_path / "a.text"
     path.write_text(text)
     with pytest.raises(MeasurementError, match=words) as told:
-        yaml_of(path, MeasurementError)
+        read(path, MeasurementError)
+    assert "a.text" in str(told.value)
     assert len(str(told.value)) < 500
 
 
-@pytest.mark.parametrize("text", ['{"a": 1, "a": 2}', "[" * 10**5, "1" * 5000, '{"a": NaN}', "{"])
-def test_json_that_is_none_is_one_sentence(tmp_path, text):
-    path = tmp_path / "a.json"
-    path.write_text(text)
-    with pytest.raises(MeasurementError, match=r"a\.json") as told:
-        json_of(path, MeasurementError)
-    assert len(str(told.value)) < 300
+def test_a_document_has_texts_where_no_type_is_run_and_values_of_its_types(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: !!python/object/apply:os.mkdir [MARK]\nb: 2001-01-01\nc: 1e3\nd: yes")
+    texts = {"a": ["MARK"], "b": "2001-01-01", "c": "1e3", "d": "yes"}
+    assert yaml_of(path, MeasurementError) == texts
+    assert not Path("MARK").exists()
+    with pytest.raises(MeasurementError, match=r"data\.unit is"):
+        check_shape(path, {"data": {"unit": ["mm"]}}, "machine", MeasurementError)
 
 
 @pytest.mark.parametrize("table", [{"x/B1L": "a"}, {"3/B1L": 3}, {"3/B1L": ["a"]}, ["3/B1L"]])

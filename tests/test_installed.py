@@ -68,13 +68,6 @@ def test_the_conda_recipe_asks_for_what_pip_does():
     assert recipe["build"]["python"]["entry_points"] == [f"tmlattice = {command}"]
 
 
-def test_a_plain_install_takes_nothing_that_only_studies_need():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    plain = {wanted.partition(">=")[0] for wanted in project["dependencies"]}
-    assert not plain & {"distributed", "dask", "scikit-learn", "torch"}
-    assert any("distributed" in wanted for wanted in project["optional-dependencies"]["dask"])
-
-
 # --- what works in a plain install, and what is said where an extra is missing --------------------
 PLAIN = (
     "import sys\n"
@@ -151,13 +144,13 @@ def test_python_names_the_extra_too(tmp_path):
     assert "local processes" in third
 
 
-def test_every_extra_brings_what_its_message_says():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
+def test_every_extra_brings_what_its_message_says_and_a_plain_install_nothing_of_it():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"] | {"plain": project["dependencies"]}
     brings = {
         name: {wanted.partition(">=")[0] for wanted in wants} for name, wants in extras.items()
     }
+    assert not brings["plain"] & {"distributed", "dask", "scikit-learn", "torch"}
     assert "torch" in brings["network"]
     assert "distributed" in brings["dask"]
     assert {"torch", "scikit-learn"} <= brings["challenge"] & brings["reproduce"]

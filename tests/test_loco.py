@@ -1,6 +1,7 @@
 """LOCO files as other versions, hands and laboratories save them."""
 
 import copy
+import itertools
 
 import at
 import numpy as np
@@ -12,7 +13,6 @@ from test_import import ENERGY, brought, design, elements, simulated  # noqa: F4
 
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
-from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
 
 pytestmark = pytest.mark.usefixtures("forked_readers")
@@ -47,11 +47,26 @@ def thering(v):
     v["THERING"] = v.pop("RINGData")["Lattice"]
 
 
+def lattice(v):
+    return v["RINGData"]["Lattice"]
+
+
+def families(*names, **fields):
+    """Fields put into all elements of some families."""
+
+    def change(v):
+        for element in lattice(v):
+            if element["FamName"] in names:
+                element.update(fields)
+
+    return change
+
+
 def cavity_without(*names):
     def change(v):
-        for element in v["RINGData"]["Lattice"]:
-            for name in names if element["FamName"] == "CAV" else ():
-                element.pop(name)
+        (cavity,) = (element for element in lattice(v) if element["FamName"] == "CAV")
+        for name in names:
+            del cavity[name]
 
     return change
 
@@ -60,12 +75,6 @@ def energy_of_globval(v):
     put("RINGData", Energy=None)(v)
     cavity_without("Energy")(v)
     v["GLOBVAL"] = {"E0": 1.5e9}
-
-
-def empty_cavity(v):
-    for element in v["RINGData"]["Lattice"]:
-        if element["FamName"] == "CAV":
-            element.update(Frequency=np.zeros(0), HarmNumber=np.nan, Voltage=np.zeros((0, 0)))
 
 
 def monitors_of_each_plane(v):
@@ -127,7 +136,8 @@ FORMS = {
     "an RF of no number": (together(put("LocoMeasData", RF=lambda f: np.nan), put(
         "RINGData", CavityHarmNumber=lambda h: np.zeros((0, 0)))), ""),
     "an RF of 0": (put("LocoMeasData", RF=lambda f: 0.0), ""),
-    "a cavity of empty fields": (empty_cavity, ""),
+    "a cavity of empty fields": (families(
+        "CAV", Frequency=np.zeros(0), HarmNumber=np.nan, Voltage=np.zeros((0, 0))), ""),
     "monitors for x and for y": (monitors_of_each_plane, "each is one BPM"),
     "flags that say nothing": (put("LocoFlags", ResponseMatrixMeasurement=lambda f: np.zeros(0)),
                                "no LocoFlags state it"),
@@ -148,11 +158,21 @@ def usual(simulated, tmp_path_factory):  # noqa: F811
     return bring_in([path], Options())
 
 
+@pytest.fixture
+def with_change(variables, brought):  # noqa: F811
+    """The file with something changed, brought in."""
+
+    def with_change(change):
+        change(variables)
+        return brought(variables)
+
+    return with_change
+
+
 @pytest.mark.parametrize("form", FORMS)
-def test_other_forms_are_the_usual_one(usual, variables, brought, form):  # noqa: F811
+def test_other_forms_are_the_usual_one(usual, with_change, form):
     change, said = FORMS[form]
-    change(variables)
-    found = brought(variables)
+    found = with_change(change)
     assert any(said in sentence for sentence in found.assumed), found.assumed
     if form != "M turned":  # of fewer correctors
         assert [e.name for e in found.ring.elements] == [e.name for e in usual.ring.elements]
@@ -267,33 +287,6 @@ def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(variables, br
 
 
 # --- lattices of LOCO files as laboratories have them: the model answers as the machine does ------
-@pytest.fixture
-def with_change(simulated, brought):  # noqa: F811
-    """The file with something changed, brought in."""
-
-    def with_change(change):
-        variables = copy.deepcopy(simulated)
-        change(variables)
-        return brought(variables)
-
-    return with_change
-
-
-def lattice(v):
-    return v["RINGData"]["Lattice"]
-
-
-def families(*names, **fields):
-    """Fields put into all elements of some families."""
-
-    def change(v):
-        for element in lattice(v):
-            if element["FamName"] in names:
-                element.update(fields)
-
-    return change
-
-
 def unused_correctors(v):
     """All of one plane, under a name that says none; one of them is not in the list."""
     families("COR", FamName="CORX")(v)
@@ -341,6 +334,18 @@ def matrix_of_a_laboratory(v):
     first.update(FamName="ID", PassMethod="MyMatrixPass", M66=matrix)
 
 
+def drifts_called(*names):
+    """One drift after the other has the next of the names."""
+
+    def change(v):
+        every = itertools.cycle(names)
+        for element in lattice(v):
+            if element["FamName"] == "DR":
+                element["FamName"] = next(every)
+
+    return change
+
+
 NONE = "is no pass method of AT: "
 LATTICES = {
     "a laboratory's own quadrupoles": (families("QF", "QD", PassMethod="StrMPoleNew4Pass"),
@@ -358,12 +363,11 @@ LATTICES = {
     "a laboratory's own matrix": (matrix_of_a_laboratory, f"{NONE}Matrix66Pass, by its fields"),
     "noise of the radiation": (noise_of_radiation, ""),
     "a table of kicks": (table_of_kicks, "InsertionDeviceKickMap"),
-} | {
-    f"a drift called {name}": (families("DR", FamName=name), "")
-    for name in ("WIG", "Wiggler", "RF", "Aperture", "Collimator", "Corrector", "Matrix66")
-} | {
-    f"a {family} called {name}": (families(family, FamName=name), "")
-    for family, name in (("QF", "RF"), ("BEND", "Quad"), ("SF", "M66"), ("CAV", "Drift"))
+    "drifts with names of AT's classes": (drifts_called(
+        "WIG", "Wiggler", "RF", "Aperture", "Collimator", "Corrector", "Matrix66"), ""),
+    "magnets with names of AT's classes": (together(
+        families("QF", FamName="RF"), families("BEND", FamName="Quad"),
+        families("SF", FamName="M66"), families("CAV", FamName="Drift")), ""),
 }  # fmt: skip
 
 
@@ -394,27 +398,6 @@ def test_a_monitor_and_corrector_at_one_place_are_both_there(with_change):
     found = with_change(change)
     assert found.measurement.monitors[0] == "cor_bpm"
     assert {"cor_h::0", "cor_v::0"} <= set(found.measurement.correctors)
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [{"PolynomB": np.array([0.0, 3.0, 80.0]), "PolynomA": np.zeros(3), "MaxOrder": 2},
-     {"BendingAngle": 0.1, "EntranceAngle": 0.05, "ExitAngle": 0.05}],
-    ids=["multipole", "bend"],
-)  # fmt: skip
-def test_a_magnet_that_at_passes_as_a_drift_is_one(fields):
-    """Tunes are AT's own, whatever its fields say."""
-    every = elements()
-    off = [own for own in every if own["FamName"] == "DR"][:2]
-    for own in off:
-        own.update(fields, FamName="OFF")
-    made = [element_from_dict(dict(own), quiet=True, check=False) for own in every]
-    there = at.Lattice(made, energy=ENERGY * 1e9, periodicity=1)
-    there.disable_6d()
-    with pytest.warns(UserWarning, match=r"pass method is DriftPass of off \(2\)"):
-        ring = ring_from_at(there, "ring", ENERGY)
-    assert [e.kind for e in ring.elements if e.family == "off"] == ["drift", "drift"]
-    assert_allclose(np.array(ring_tunes(ring)) % 1, at.get_tune(there), atol=1e-3)
 
 
 def linear_wiggler(v):

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tfs
-from ocelot.cpbd.elements import Solenoid
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
@@ -81,6 +80,12 @@ def with_element(element):
 
 
 REFUSED = {
+    "no beam": (PLAIN.split("\n", 1)[1], "no BEAM with an energy; give energy="),
+    "no ring": ("q: quadrupole, l=0.1, k1=1;\n", "no SEQUENCE and no LINE"),
+    "no element": (
+        "s: sequence, l=1; nothing, at=0.5; endsequence; beam, pc=1;",
+        "cannot be read as MAD-X: .*nothing",
+    ),
     "match": (PLAIN + "match, sequence=ring; vary, name=kq; endmatch;", "MATCH changes strengths"),
     "ealign": (PLAIN + "use, sequence=ring; ealign, dx=1e-4;", "EALIGN moves elements"),
     "efcomp": (PLAIN + "efcomp, order=0, dkn={1e-4};", "EFCOMP gives elements field errors"),
@@ -166,6 +171,10 @@ REFUSED = {
     "line": (PLAIN + "qf, k1=1..2;", r"in the statement 'qf, k1=1..2', line \d+ of ring.madx"),
 }  # fmt: skip
 WARNED = {
+    "variable without a value": (
+        PLAIN + "qf, k1:=kq + kp; kp = 1;",
+        r"kq \(1\) have no value: taken for 0, as by MAD-X",
+    ),
     "makethin": (PLAIN + "makethin, sequence=ring;", "MAKETHIN is not carried out"),
     "system": (PLAIN + 'system, "touch x";', "SYSTEM is not run"),
     "thick knl": (PLAIN + "qf, knl={0,0.01};", r"left out.*KNL of the QUADRUPOLE .* of qf \(1\)"),
@@ -270,63 +279,46 @@ def matrix(folder, text):
     return ring_matrix(strictly(folder, text))[:4, :4]
 
 
-def test_collimators_are_ways_and_other_words_are_named(tmp_path):
-    """PETRA III; it also defines `none`, which AT takes for all that is unknown."""
-    text = (
-        "none = 0;\nc: {}, l:=0.2, xsize:=0.06;\ne: ecollimator, l:=0;\nq: quadrupole, l=0.5, k1=1;"
-        "\nring: sequence, l=2;\nc, at=0.5;\ne, at=1;\nq, at=1.5;\nendsequence;\n"
-    )
-    ring = strictly(tmp_path, text.format("rcollimator"))
-    assert ring.length == pytest.approx(2)
-    assert ring["c"].kind == "drift"
-    assert ring["c"].length == pytest.approx(0.2)
-    with pytest.raises(LatticeError, match="no element or command 'rcolimator' is known"):
-        strictly(tmp_path, text.format("rcolimator"))
-
-
-def test_a_solenoid_turns_and_focuses(tmp_path):
-    """R12 = sin(KS L) / KS; OCELOT's k is KS / 2."""
-    found = matrix(tmp_path, "s: solenoid, l=0.8, ks=0.4;\nring: line=(s);\n")
-    assert found[0, 1] == pytest.approx(np.sin(0.32) / 0.4, rel=1e-9)
-    np.testing.assert_allclose(found, Solenoid(l=0.8, k=0.2).R(3.0)[0][:4, :4], atol=1e-9)
-
-
-def test_edges_that_stand_by_themselves_are_those_of_the_bend(tmp_path):
-    edges = "e1=0.08, hgap=0.03, fint=0.5"
-    whole = matrix(tmp_path, f"b: sbend, l=1, angle=0.2, e2=0.08, {edges};\nring: line=(b);\n")
-    bend = f"b: sbend, l=1, angle=0.2;\ne: dipedge, h=0.2, {edges};\n"
-    apart = matrix(tmp_path, bend + "ring: line=(e, b, e);\n")
-    np.testing.assert_allclose(apart, whole, atol=1e-12)
-    assert abs(whole[3, 2]) > 1e-3
-    flat, upright = (
-        matrix(tmp_path, f"{D}e: dipedge, h=0.2, {edges}, tilt={tilt};\nring: line=(e, d);\n")
-        for tilt in ("0", "pi/2")
-    )
+def test_edges_that_stand_by_themselves_are_turned_with_their_gap(tmp_path):
+    """MAD-X's figures of a `dipedge` are those of two decks, of which none has both."""
+    edge = D + "e: dipedge, h=0.2, e1=0.08, hgap=0.03, fint=0.5, tilt={};\nring: line=(e, d);\n"
+    flat, upright = (matrix(tmp_path, edge.format(tilt)) for tilt in ("0", "pi/2"))
     np.testing.assert_allclose(upright[[1, 3], [0, 2]], flat[[3, 1], [2, 0]], atol=1e-12)
-    # without a gap it is a thin quadrupole, turned the same way
-    edge = matrix(tmp_path, f"{D}e: dipedge, h=0.2, e1=0.08, tilt=0.3;\nring: line=(e, d);\n")
-    k1 = -0.2 * np.tan(0.08) / 1e-6
-    thin = matrix(tmp_path, f"q: quadrupole, l=1e-6, k1={k1}, tilt=0.3;\nring: line=(q);\n")
-    np.testing.assert_allclose(edge, thin, atol=2e-6)
-    assert abs(thin[1, 2]) > 1e-3
+    assert abs(flat[3, 2]) > 1e-3
 
 
-def test_names_without_a_value_are_zero_and_told(tmp_path):
-    path = tmp_path / "ring.madx"
-    path.write_text(
-        BEAM + "q: quadrupole, l=0.5, k1:=kq;\np: quadrupole, l=0.5, k1:=2*kp;\nkp = 1;\n"
-        "ring: line=(q, p);\n"
-    )
-    with pytest.warns(UserWarning, match=r"kq \(1\) have no value: taken for 0, as by MAD-X"):
-        ring = load_ring(path)
-    assert (ring["q"].k1, ring["p"].k1) == (0.0, 2.0)
+STRICT = {  # what each real file had is read without a word, and gives this length
+    "collimator, and `none` as a name, PETRA III": (
+        "none = 0; c: rcollimator, l:=0.2, xsize:=0.06; e: ecollimator, l:=0;\n"
+        "ring: line=(c, e, c);\n", 0.4),
+    "rectangular bend without an angle, PS Booster": ("b: rbend, l=1.6; ring: line=(b);\n", 1.6),
+    "brackets that are no list, LHC": (
+        "a = 0.3; b = 0.1; one := (a/3)*(1-b); two := (a+b); m: multipole, knl:={two};\n"
+        "q: drift, l:=one; p: drift, l:=(two); ring: line=(q, p);\n", 0.49),
+    "lines that go on as in MAD-8": (
+        'a: drift, l=1;\nb: drift, l=2;\nring: line=(a, &\n b, a);\ntitle, "a & b";\n', 4.0),
+}  # fmt: skip
 
 
-def test_a_rectangular_bend_may_have_no_angle(tmp_path):
-    """PS Booster: its bends get theirs from a file of strengths."""
-    ring = strictly(tmp_path, "b: rbend, l=1.6;\nring: sequence, l=3;\nb, at=1.5;\nendsequence;\n")
-    assert ring["b"].length == pytest.approx(1.6)
-    assert ring["b"].angle == 0
+@pytest.mark.parametrize("what", STRICT)
+def test_words_of_real_files_are_read_in_silence(tmp_path, what):
+    text, length = STRICT[what]
+    assert strictly(tmp_path, text).length == pytest.approx(length)
+
+
+def test_brackets_within_a_list(tmp_path):
+    thin = matrix(tmp_path, D + "m: multipole, knl:={0, (0.3)*(0.1)};\nring: line=(m, d);\n")
+    assert thin[1, 0] == pytest.approx(-0.03)
+
+
+def test_kinds_of_classes(tmp_path):
+    ring = read(tmp_path, with_element(
+        "ck: kicker, at=4.9; m2: hmonitor, at=5; screen: instrument, at=5.05; c: rcollimator, "
+        "l=0.02, at=5.08; rf: rfcavity, volt=0.1, harmon=8, at=5.1;"))  # fmt: skip
+    wanted = {"quadrupole": 16, "bend": 16, "sextupole": 8, "hcorrector": 16, "vcorrector": 16,
+              "monitor": 24, "marker": 8, "cavity": 8}  # fmt: skip
+    assert {kind: ring.counts()[kind] for kind in wanted} == wanted
+    assert (ring["c::0"].kind, ring["sf::0"].k2) == ("drift", 3.0)
 
 
 PARTS = """d: drift, l=1;
@@ -343,25 +335,8 @@ def test_the_sequence_that_stands_in_no_other_is_the_ring(tmp_path):
     with pytest.raises(LatticeError, match="has the sequences whole, second; name one"):
         strictly(tmp_path, more)
     assert strictly(tmp_path, more, sequence="part.1").length == pytest.approx(2)
-
-
-def test_an_expression_in_brackets_is_no_list(tmp_path):
-    """LHC: ad34.lr3 := (aip3/3)*(1-r0) was the list of 'aip3/3)*(1-r0'."""
-    ring = strictly(
-        tmp_path,
-        "a = 0.3; b = 0.1;\none := (a/3)*(1-b);\ntwo := (a+b);\n"
-        "q: quadrupole, l=0.5, k1:=one;\np: quadrupole, l=0.5, k1:=(two);\n"
-        "m: multipole, knl:={0, (a)*(b)};\nm1: multipole, knl:={two};\nring: line=(q, p, m);\n",
-    )
-    assert ring["q"].k1 == pytest.approx(0.09)
-    assert ring["p"].k1 == pytest.approx(0.4)
-    thin = matrix(tmp_path, D + "m: multipole, knl:={0, (0.3)*(0.1)};\nring: line=(m, d);\n")
-    assert thin[1, 0] == pytest.approx(-0.03)
-
-
-def test_lines_may_go_on_as_in_mad_8(tmp_path):
-    text = 'a: drift, l=1;\nb: drift, l=2;\nring: line=(a, &\n b, a);\ntitle, "a & b";\n'
-    assert strictly(tmp_path, text).length == pytest.approx(4)
+    with pytest.raises(LatticeError, match=r"no sequence in .* named 'secon'; did you mean 'seco"):
+        strictly(tmp_path, more, sequence="secon")
 
 
 @pytest.mark.parametrize("code", ["latin-1", "utf-16", "utf-8-sig"])

@@ -8,7 +8,6 @@ from tmlattice import load_ring
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.lattice.load import contents
-from tmlattice.maps import ring_matrix
 
 M_FILE = """function ring = fodo()
 %FODO  as atwritem writes it (2003)
@@ -97,6 +96,11 @@ CODE = {
         ring="ring = c;",
     ),
     "structures": function(f"QF = {STRUCT};"),
+    "elements of no class of AT's own": function(
+        "QF = atbaselem('QF', 'StrMPoleSymplectic4Pass', 'Length', 0.4, 'PolynomB', [0 1.1], ...\n"
+        "  'PolynomA', [0 0], 'MaxOrder', 1, 'NumIntSteps', 10);\n"
+        "M = atbaselem('BPM', 'IdentityPass', 'Class', 'Monitor');"
+    ),
     "structures by their fields": function(
         "D1 = []; D1.FamName = 'D1'; D1.PassMethod = 'DriftPass'; D1.Length = 0.5;"
     ),
@@ -264,16 +268,3 @@ def test_the_ring_of_several_lists_is_chosen_by_its_name(tmp_path, known):
     with pytest.raises(LatticeError, match=r"no variable is the list of .*; lists are one, other"):
         read(tmp_path, text)
     assert contents(read(tmp_path, text, sequence="one")) == contents(known)
-
-
-def test_element_written_by_its_attributes_alone(tmp_path, known):
-    """As AT writes elements of no class of its own."""
-    plain = "atbaselem('QF','StrMPoleSymplectic4Pass','Length',0.4,'PolynomB',[0 1.1],"
-    plain += "'PolynomA',[0 0],'MaxOrder',1,'NumIntSteps',40);\n"
-    text = (
-        M_FILE[: M_FILE.index("atmonitor")] + "atbaselem('B','IdentityPass','Class','Monitor');\n"
-    )
-    text += plain + M_FILE[M_FILE.index("atdrift('D1'") :]
-    ring = read(tmp_path, text)
-    assert ring.counts()["monitor"] == 16
-    np.testing.assert_allclose(ring_matrix(ring), ring_matrix(known), rtol=0, atol=1e-9)

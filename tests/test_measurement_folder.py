@@ -336,20 +336,16 @@ def test_damaged_document_names_its_place(folder, changes, words):
         (b'{"version": NaN}', "NaN is not JSON"),
         (b'{"version": 1, "version": 1}', "stands twice"),
         (b"[" * 100_000, "measurement.json"),
+        (
+            json.dumps(DOCUMENT).replace("0.0005", "1e999", 1).encode(),
+            r"shots\[0\].launch.x is not finite",
+        ),
     ],
 )
 def test_document_that_is_no_document(folder, text, words):
     there = folder()
     (there / "measurement.json").write_bytes(text)
     with pytest.raises(MeasurementError, match=words):
-        read_measurement(there)
-
-
-def test_number_too_large_for_a_float_is_not_finite(folder):
-    there = folder()
-    text = (there / "measurement.json").read_text().replace("0.0005", "1e999", 1)
-    (there / "measurement.json").write_text(text)
-    with pytest.raises(MeasurementError, match=r"shots\[0\].launch.x is not finite"):
         read_measurement(there)
 
 
@@ -505,8 +501,8 @@ def peak_memory(folder, shots, rng):
 
 def test_memory_of_the_writer_is_flat_in_the_number_of_shots(tmp_path, rng):
     peak_memory(tmp_path / "warm", 2, rng)
-    few, many = (peak_memory(tmp_path / f"m{n}", n, rng) for n in (10, 110))
-    assert many - few < 50_000  # the set of ids, 0.01 MB; 100 shots of 32 kB would be 3 MB
+    few, many = (peak_memory(tmp_path / f"m{n}", n, rng) for n in (10, 50))
+    assert many - few < 50_000  # the set of ids, 0.01 MB; 40 shots of 32 kB would be 1.3 MB
 
 
 # The truth

@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 
 from tmlattice.errors import MeasurementError
-from tmlattice.lattice.binary_files import turns
-from tmlattice.measurement import read_measurement, read_table, read_turn_by_turn, tables
+from tmlattice.measurement import read_measurement, read_table, read_turn_by_turn
 
 pytestmark = pytest.mark.usefixtures("forked_readers")
 
@@ -102,18 +101,14 @@ def test_millimetres_taken_for_metres_are_refused(tmp_path, ring_data):
     np.testing.assert_allclose(m.readings, 1e-3 * ring_data, rtol=1e-7)
 
 
-def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data, monkeypatch):
-    """As of the SPS: 201 columns where 200 turns are stated; monitors of one plane each."""
+def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data):
+    """As of the SPS: a turn more than is stated; monitors of one plane each."""
     import turn_by_turn as tbt
 
     x = pd.DataFrame(ring_data[0, :, :2, 0].T, index=["BPH.1", "BPH.2"])
     y = pd.DataFrame(ring_data[0, :, 2:, 1].T, index=["BPV.1"])
     stated = tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 29, bunch_ids=[0])
-    monkeypatch.setattr(tbt, "read", lambda path, datatype: stated)
-    monkeypatch.setattr(  # in this process
-        tables, "read_apart", lambda kind, path, what, error, *more: turns(str(path), *more)
-    )
-    (tmp_path / "a.sdds").touch()
+    tbt.write(tmp_path / "a.sdds", stated, datatype="sps")
     m = read_turn_by_turn(tmp_path / "a.sdds", "sps", unit="mm")
     assert m.readings.shape == (1, 30, 3, 2)
     np.testing.assert_allclose(m.readings[0, :, 2, 1], 1e-3 * ring_data[0, :, 2, 1])

@@ -31,7 +31,7 @@ from tmlattice.observe.calibration import (
     write_calibration,
 )
 from tmlattice.observe.orbit_response import Errors, Predicted, response_change
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import response_data
 
 STEP = -2000.0
 """Hz."""
@@ -58,16 +58,18 @@ def with_kicks(ring, measured, more):
     )
 
 
-def state_of(ring, measured, fit):
-    data, split = parted(ring, measured, 1)
-    return fit_families(data, split, WITHOUT).state if fit else begin(data, split)
-
-
 @pytest.fixture(scope="module")
 def plain(small_ring):
     """Without sextupoles, in which an orbit would make gradients."""
     places = [i for i, e in enumerate(small_ring.elements) if e.kind == "sextupole"]
     return small_ring.with_elements({i: small_ring.elements[i].changed(k2=0.0) for i in places})
+
+
+@pytest.fixture(scope="module")
+def design(plain):
+    """Where a fit of its response begins."""
+    measured = simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot")
+    return begin(*parted(plain, measured, 1))
 
 
 def displaced(plain, plane):
@@ -89,10 +91,9 @@ def beside(plain):
     return displaced(plain, 0)
 
 
-def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, beside):
-    state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
+def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(design, beside):
     family = HorizontalKicks()
-    patterns = family.rows(state.at, np.zeros(family.size(state.data)))
+    patterns = family.rows(design.at, np.zeros(family.size(design.data)))
     assert len(patterns) < len(beside) / 2
     amounts = np.linalg.lstsq(patterns[:, -1].T, beside, rcond=None)[0]
     left = beside - amounts @ patterns[:, -1]
@@ -102,9 +103,8 @@ def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, bes
     assert 1e-4 < np.sqrt(np.mean(amounts**2)) < 2e-3
 
 
-def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain):
-    state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
-    across, along = (patterns_of_kicks(state.at, plane).rf for plane in (1, 0))
+def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain, design):
+    across, along = (patterns_of_kicks(design.at, plane).rf for plane in (1, 0))
     more = displaced(plain, 1)
     left = [
         np.std(more - np.linalg.lstsq(own.T, more, rcond=None)[0] @ own)
@@ -128,8 +128,8 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
     amounts = {cause.element: cause.amount for cause in causes}
     missed, said = [], []
     for own, steps in ((plain, WITH), (kicked, WITH), (kicked, WITHOUT)):
-        data = response_data(small_ring, own)
-        fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        data, split = parted(small_ring, own, 1)
+        fit = fit_families(data, split, steps)
         true = [amounts[name] for name in QuadrupoleGradient().places(data)]
         missed.append(np.std(fit.state.values["gradient"] - true))
         said.append(len(list(dispersion_by_kicks(fit.state.values, data))))

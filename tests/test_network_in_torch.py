@@ -26,6 +26,11 @@ def short(tmp_path, rng):
     return network, torch.from_numpy(0.1 * rng.standard_normal((3, 4)))
 
 
+@pytest.fixture
+def network(small_ring):
+    return TaylorNetwork.from_ring(small_ring)
+
+
 @pytest.mark.parametrize("dimension", [4, 6])
 def test_readings_of_several_turns_are_those_of_the_tracked_states(small_ring, dimension, rng):
     network = TaylorNetwork.from_ring(small_ring, dimension)
@@ -50,8 +55,7 @@ def test_second_derivatives_match_finite_differences(short):
     assert torch.autograd.gradgradcheck(lambda x, *_: network(x), wanted)
 
 
-def test_a_lost_trajectory_reads_inf_and_leaves_the_others_alone(small_ring, rng):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_a_lost_trajectory_reads_inf_and_leaves_the_others_alone(network, rng):
     launch = 1e-5 * rng.standard_normal((3, 4))
     launch[1, 0] = 1e3
     with pytest.raises(BeamLostError, match="trajectory 1 is lost"):
@@ -68,16 +72,14 @@ def test_a_lost_trajectory_reads_inf_and_leaves_the_others_alone(small_ring, rng
     assert (got - network.W1.grad).abs().max() <= 1e-12 * got.abs().max()
 
 
-def test_all_trajectories_may_be_lost(small_ring):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_all_trajectories_may_be_lost(network):
     loss = network([[1e3, 0, 0, 0]], turns=2, on_lost="inf").square().sum()
     loss.backward()
     assert torch.isinf(loss)
     assert not network.W1.grad.any()
 
 
-def test_lbfgs_goes_on_where_a_step_loses_the_beam(small_ring, rng):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_lbfgs_goes_on_where_a_step_loses_the_beam(network, rng):
     launch = 1e-4 * rng.standard_normal((2, 4))
     target = 1.1 * network(launch).detach()
     optimiser = torch.optim.LBFGS(
@@ -99,24 +101,21 @@ def test_lbfgs_goes_on_where_a_step_loses_the_beam(small_ring, rng):
 
 
 @pytest.mark.parametrize("convert", ["float", "half", "bfloat16"])
-def test_another_type_is_refused_in_a_sentence(small_ring, convert):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_another_type_is_refused_in_a_sentence(network, convert):
     with pytest.raises(TypeError, match="computes in float64, not"):
         getattr(network, convert)()
     assert network.W0.dtype == torch.float64
     assert network.double().to("cpu") is network
 
 
-def test_a_device_without_sweeps_is_refused_in_a_sentence(small_ring):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_a_device_without_sweeps_is_refused_in_a_sentence(network):
     with pytest.raises(TypeError, match="TaylorNetwork does not run on 'meta'; it runs on cpu"):
         network.to("meta")
     with pytest.raises(TypeError, match="SymplecticNetwork does not run on 'meta'"):
         network.symplectic().to("meta")
 
 
-def test_a_launch_of_float32_gives_readings_of_float64(small_ring):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_a_launch_of_float32_gives_readings_of_float64(network):
     assert network(torch.full((1, 4), 1e-5)).dtype == torch.float64
 
 
@@ -152,8 +151,7 @@ def test_any_transform_works_on_the_plain_loop(short):
         assert torch.allclose(moved, hessian[i], rtol=1e-6, atol=1e-8)
 
 
-def test_only_the_layers_of_a_group_move(small_ring, rng):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_only_the_layers_of_a_group_move(small_ring, network, rng):
     quadrupoles = [m.kind == "quadrupole" for m in small_ring.magnets]
     part = FreeLayers(network, {"quadrupoles": "quadrupole"}, weights=("W1",))
     assert [tuple(p.shape) for p in part.parameters() if p.requires_grad] == [
@@ -176,8 +174,7 @@ def test_only_the_layers_of_a_group_move(small_ring, rng):
     assert (part.merged().W2 == network.W2).all()
 
 
-def test_the_gradient_of_a_group_is_that_of_its_layers(small_ring, rng):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_the_gradient_of_a_group_is_that_of_its_layers(network, rng):
     names = network.layers[3], network.layers[10]
     part = FreeLayers(network, {"two": names})
     launch = 1e-5 * rng.standard_normal((4, 4))
@@ -188,8 +185,7 @@ def test_the_gradient_of_a_group_is_that_of_its_layers(small_ring, rng):
         assert (got == getattr(network, name).grad[[3, 10]]).all()
 
 
-def test_groups_that_are_empty_or_share_a_layer_are_refused(small_ring):
-    network = TaylorNetwork.from_ring(small_ring)
+def test_groups_that_are_empty_or_share_a_layer_are_refused(network):
     with pytest.raises(LatticeError, match="group 'a': no layer is a 'qx' or has such a name"):
         FreeLayers(network, {"a": "qx"})
     with pytest.raises(LatticeError, match="groups 'a' and 'b' share the layer"):

@@ -8,8 +8,9 @@ from shared import valid
 from tmlattice import Cause, diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis import next_measurement as module
-from tmlattice.diagnosis.kinds import KINDS, PartOptions
+from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.next_measurement import next_kind
+from tmlattice.diagnosis.options import Options
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.report.action_texts import next_text
@@ -30,7 +31,7 @@ def tunes(small_ring):
 
 
 def how(**more):
-    return PartOptions(ring=None, places={}, judgement=DEFAULT, **more)
+    return Options(ring=None, places={}, judgement=DEFAULT, **more)
 
 
 def test_what_is_proposed_parts_them(small_ring, tunes):
@@ -66,10 +67,8 @@ def test_the_dearer_of_two_that_part_alike_is_not_proposed(small_ring, tunes, mo
     seen = {**how().__dict__, "ring": small_ring}
     ask = (small_ring, diagnosis.explanation)
     monkeypatch.setattr(module, "separation", lambda problem, pair: 10.0)
-    assert next_kind(*ask, ["tunes"], PartOptions(**seen), ()).kind == "closed_orbit"
-    assert (
-        next_kind(*ask, ["tunes", "closed_orbit"], PartOptions(**seen), ()).kind == "turn_by_turn"
-    )
+    assert next_kind(*ask, ["tunes"], Options(**seen), ()).kind == "closed_orbit"
+    assert next_kind(*ask, ["tunes", "closed_orbit"], Options(**seen), ()).kind == "turn_by_turn"
 
 
 def test_nothing_is_proposed_that_gains_little(small_ring, tunes, monkeypatch):

@@ -43,9 +43,9 @@ def test_noise_is_estimated_once_from_measurement_and_reference(small_ring):
     """Small errors everywhere, which neighbours leave of one another, are not taken for noise."""
     options = {"background": {"all": None}, "machine_seed": 7, "noise": NOISE, "amplitude": 4e-4,
                "engine": "ocelot"}  # fmt: skip
-    before = simulate(small_ring, [], shots=5, seed=1, **options).measurement()
+    before = simulate(small_ring, [], shots=3, seed=1, **options).measurement()
     fault = Cause("quadrupole_gradient", "QD::5", -0.05)
-    after = simulate(small_ring, [fault], shots=5, seed=2, **options).measurement()
+    after = simulate(small_ring, [fault], shots=3, seed=2, **options).measurement()
     told = []
     before, after = (replace(own, noise=None) for own in (before, after))
     effects = ["quadrupole_gradient", "quadrupole_offset_x", "quadrupole_offset_y"]

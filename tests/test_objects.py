@@ -1,7 +1,6 @@
 """Objects of other packages as rings and back; referees: their own orbits, tunes, dispersion."""
 
 import functools
-import inspect
 import io
 import sys
 import warnings
@@ -302,14 +301,13 @@ def of_madx(ring, start):
     return [summary.q1[0], summary.q2[0]], orbit, dispersion
 
 
-def differences(ring, package, request):
-    """Largest differences of tunes, closed orbit (m), dispersion (m) from `ring.twiss()`."""
+def differences(ring, own, package, request):
+    """Largest differences of tunes, closed orbit (m), dispersion (m) from its `ring.twiss()`."""
     of = {"AT": of_at, "OCELOT": of_ocelot, "xtrack": of_xtrack}
     if package == "MAD-X":
         tunes, orbit, dispersion = of_madx(ring, request.getfixturevalue("madx"))
     else:
         tunes, orbit, dispersion = of[package](ring)
-    own = ring.twiss()
     rows = slice(orbit.shape[1])
     away = (np.asarray(tunes) - own.total_tunes + 0.5) % 1 - 0.5
     return [
@@ -341,14 +339,16 @@ TABLE = {
 
 @functools.cache
 def loaded(name):
+    """The ring and its own optics."""
     place = RINGS[name]
-    return quiet(load_ring, measured_data(place) if name == "sps" else place)
+    ring = quiet(load_ring, measured_data(place) if name == "sps" else place)
+    return ring, ring.twiss()
 
 
 @pytest.mark.parametrize("name", RINGS)
 @pytest.mark.parametrize("package", PACKAGES)
 def test_ten_rings_have_the_same_optics_in_every_package(package, name, request):
-    tunes, orbit, dispersion = differences(loaded(name), package, request)
+    tunes, orbit, dispersion = differences(*loaded(name), package, request)
     (_, most), (_, most_dispersion) = TABLE[package]
     assert orbit < 2e-9  # xtrack's search ends at 1e-9 m
     assert tunes < most
@@ -392,7 +392,7 @@ def test_estimated_ring_has_its_errors_in_every_package(small_ring, package, req
     assert abs(found.total_tunes - design.total_tunes).min() > 1e-3
     assert min(abs(found.x).max(), abs(found.y).max()) > 3e-4
     assert abs(found.dy).max() > 1e-2
-    for amount, most in zip(differences(ring, package, request), allowed, strict=True):
+    for amount, most in zip(differences(ring, found, package, request), allowed, strict=True):
         assert amount < most
 
 
@@ -518,8 +518,9 @@ def test_ring_is_a_container_of_its_elements(small_ring):
     assert {e.kind for e in small_ring["q[fd]"]} == {"quadrupole"}
     assert "qd::5" in small_ring
     assert "qd::99" not in small_ring
-    with pytest.raises(UnknownNameError, match=r"no element 'qdd::1'; did you mean 'QD::1"):
-        small_ring["qdd::1"]
+    for wrong in ("qdd::1", "qd:1"):
+        with pytest.raises(UnknownNameError, match=f"no element '{wrong}'; did you mean .*'QD::1"):
+            small_ring[wrong]
     with pytest.raises(UnknownNameError, match=r"no element like 'bendd\*'; did you mean 'bend'"):
         small_ring["bendd*"]
 
@@ -530,14 +531,6 @@ def test_frame_of_a_ring(small_ring):
     assert frame.loc["QD::5", "k1"] == pytest.approx(-0.9 * 0.95)
     assert frame.loc["QF::7", "dx"] == 1e-4
     assert frame.query("kind == 'quadrupole'").length.sum() == pytest.approx(32 * 0.4)
-
-
-def test_methods_are_seen_by_editors(small_ring):
-    for name in ("to_at", "to_ocelot", "to_xtrack", "to_madx", "to_dataframe", "twiss"):
-        method = getattr(small_ring, name)
-        assert name in dir(small_ring)
-        assert [*inspect.signature(method).parameters] == ["calibration"] * (name == "to_madx")
-        assert method.__doc__.startswith("Return")
 
 
 def test_xtrack_that_is_not_installed_is_one_sentence(small_ring, tmp_path, monkeypatch):

@@ -43,9 +43,7 @@ def before(small_ring):
 @pytest.fixture(scope="module")
 def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
-    data, split = parted(small_ring, before)
-    design = begin(data, split)
-    return rough_fit(design, STEPS)
+    return rough_fit(begin(*parted(small_ring, before)), STEPS)
 
 
 @pytest.fixture(scope="module")

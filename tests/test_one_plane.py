@@ -81,11 +81,6 @@ def test_the_check_states_which_plane_was_not_read(petra3):
     assert {check.name for check in found.reported} == {"planes"}
 
 
-def test_both_planes_are_read(small_ring):
-    found = check_data(small_ring, simulate(small_ring, shots=3).measurement())
-    assert [check.status for check in found.checks if check.name == "planes"] == ["fine"]
-
-
 def test_what_passes_an_unknown_orbit_on_has_no_amount(small_ring):
     """Half of the other orbit and twice the roll read the same."""
     cause = Cause("quadrupole_roll", "QD::5", 0.05)

@@ -58,7 +58,7 @@ def test_chromaticity_dispersion_and_compaction(petra3, referee, referee_optics)
     np.testing.assert_allclose(mine.chromaticity, ring_data.chromaticity, atol=0.02)
     exits = [i + 1 for i, e in enumerate(petra3.elements) if e.is_magnet]
     np.testing.assert_allclose(mine.dispersion[1:, 0], elements.dispersion[exits, 0], atol=2e-3)
-    compaction = at.get_mcf(referee, dp_step=1e-4)
+    compaction = at.get_mcf(referee, DPStep=1e-4)
     np.testing.assert_allclose(mine.momentum_compaction, compaction, rtol=5e-3)
 
 

@@ -1,4 +1,4 @@
-"""Rings as other codes keep them: MAD-X's tables, Xsuite's JSON, elegant's lines."""
+"""Rings as other codes keep them: MAD-X's tables and a line that Xsuite wrote."""
 
 import json
 from pathlib import Path
@@ -303,53 +303,6 @@ def test_line_of_xsuite_has_xsuites_tunes():
     np.testing.assert_allclose(slopes, CHROMATICITY, rtol=5e-3)  # a slope over a finite step
     marked = load_ring(XSUITE, monitors="bpm")
     assert len(marked.monitors) == 32
-
-
-def test_environment_of_xsuite_wants_its_line_named(tmp_path):
-    line = json.loads(XSUITE.read_text())
-    elements = line.pop("elements")
-    content = {"xtrack_version": line["xtrack_version"], "elements": elements,
-               "lines": {"one": line, "two": line}}  # fmt: skip
-    path = tmp_path / "environment.json"
-    path.write_text(json.dumps(content))
-    with pytest.raises(LatticeError, match="has the sequences one, two; name one"):
-        load_ring(path)
-    assert load_ring(path, sequence="two").length == load_ring(XSUITE).length
-    line.pop("particle_ref")
-    path.write_text(json.dumps({**line, "elements": elements}))
-    with pytest.raises(LatticeError, match="no reference particle; give energy="):
-        load_ring(path)
-
-
-ELEGANT = """
-QF: KQUAD, L=0.4, K1=0.9
-QD: KQUAD, L=0.4, K1=-0.95
-B: CSBEND, L=1.2, ANGLE=0.39269908169872414, E1=0.19634954084936207, E2=0.19634954084936207
-SF: KSEXT, L=0.2, K2=6.0
-BPM: MONI
-C: KICKER
-D: DRIF, L=0.5
-CELL: LINE=(BPM, QF, D, SF, C, D, B, D, QD, D, B, D)
-RING: LINE=(CELL, CELL, CELL, CELL, CELL, CELL, CELL, CELL)
-"""
-
-
-def test_line_of_elegant(tmp_path):
-    path = tmp_path / "ring.lte"
-    path.write_text(ELEGANT)
-    with pytest.raises(LatticeError, match="no beam energy; give energy="):
-        load_ring(path)
-    ring = load_ring(path, energy=3.0)
-    assert len(ring.monitors) == 8
-    assert ring["sf::2"].k2 == pytest.approx(6.0)
-    assert ring["b::0"].angle == pytest.approx(np.pi / 8)
-    assert {e.kind for e in ring.elements if e.family.startswith("c_")} == {
-        "hcorrector", "vcorrector"
-    }  # fmt: skip
-    assert ring.length == pytest.approx(8 * (0.8 + 2.4 + 0.2 + 5 * 0.5))
-    path.write_text("Q: KQUAD, L=0.4\n")
-    with pytest.raises(LatticeError, match="no SEQUENCE and no LINE"):
-        load_ring(path, energy=3.0)
 
 
 def test_orbit_that_nothing_in_a_table_makes_is_a_contradiction(madx, tmp_path):

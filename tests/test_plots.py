@@ -8,22 +8,18 @@ import numpy as np
 import pytest
 from at_ring import at_lattice
 from numpy.testing import assert_allclose
+from shared import first_turns
 
-from tmlattice import Cause, diagnose, one_turn_optics, simulate, twiss
+from tmlattice import Cause, diagnose, one_turn_optics, twiss
 from tmlattice.lattice.survey import survey
 from tmlattice.plots import plan, plot_betas, plot_phase_space
 from tmlattice.plots.readings import before_findings, design_readings, plot_readings
 
-SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
-
-
-def found(ring, cause):
-    return diagnose(ring, simulate(ring, [cause], **SHOTS).measurement())
-
 
 @pytest.fixture(scope="module")
 def weak(small_ring):
-    return found(small_ring, Cause("quadrupole_gradient", "QD::9", -0.05))
+    turns = first_turns(small_ring, [Cause("quadrupole_gradient", "QD::9", -0.05)])
+    return diagnose(small_ring, turns)
 
 
 def test_gap_of_the_design_begins_at_the_finding(small_ring, weak):

@@ -86,14 +86,8 @@ def engine_dispersion(engine):
 
 
 def at_compaction(engine):
-    lattice = engine.lattice()
-    ends = []
-    for delta in (-1e-4, 1e-4):
-        state = at.find_orbit4(lattice, delta)[0]
-        line = [e for e in lattice if e.FamName != "velocity"]
-        out = at.Lattice(line, energy=1e9).track(state[:, None].copy(order="F"))[0]
-        ends.append(out[5, 0, 0, 0])
-    return (ends[1] - ends[0]) / 2e-4 / lattice.circumference
+    line = [e for e in engine.lattice() if e.FamName != "velocity"]
+    return at.get_mcf(at.Lattice(line, energy=1e9), DPStep=2e-4)
 
 
 @pytest.mark.parametrize("energy", [ENERGY, 2.5])

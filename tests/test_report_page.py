@@ -5,8 +5,9 @@ import shutil
 
 import numpy as np
 import pytest
+import shared
 
-from tmlattice import Cause, diagnose, load_ring, simulate
+from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import apply
@@ -45,9 +46,7 @@ def written(diagnosis, folder):
 
 @pytest.fixture(scope="module")
 def first_turns(small_ring, tmp_path_factory):
-    data = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
-                    noise=2e-6).measurement()  # fmt: skip
-    found = diagnose(small_ring, data, effects=EFFECTS)
+    found = diagnose(small_ring, shared.first_turns(small_ring, [WEAK]), effects=EFFECTS)
     return written(fits_terminals(found), tmp_path_factory.mktemp("first_turns"))
 
 
@@ -65,8 +64,7 @@ def response(small_ring, tmp_path_factory):
 @pytest.fixture(scope="module")
 def together(small_ring, tmp_path_factory):
     """First turns and the tunes of the same machine."""
-    turns = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
-                     noise=2e-6).measurement()  # fmt: skip
+    turns = shared.first_turns(small_ring, [WEAK])
     beam = StoredBeam(ResponseModel(apply(small_ring, [WEAK])))
     tunes = TuneReading(tune=beam.tunes[None], tune_error=np.full((1, 2), 1e-4))
     found = diagnose(small_ring, {"turns": turns, "tunes": tunes}, effects=EFFECTS)
@@ -135,7 +133,25 @@ def hovered(tab, figure, name):
     return hover.first.text_content()
 
 
-def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turns):
+def zoomed(tab, figure):
+    """Drag the mouse over a figure; it ends once another range of x is drawn."""
+    own = f'.figure[data-figure="data-{figure}"]'
+    place = tab.locator(own)
+    place.scroll_into_view_if_needed()
+    shown = "place => place._fullLayout.xaxis.range"
+    before = place.evaluate(shown)
+    box = place.locator(".xy .nsewdrag, .nsewdrag").first.bounding_box()
+    tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 20)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 25, steps=5)
+    tab.mouse.up()
+    tab.wait_for_function(
+        f"before => String(({shown})(document.querySelector('{own}'))) !== before",
+        arg=",".join(map(str, before)),
+    )
+
+
+def test_first_turns_have_every_section_hover_tells_names_and_zoom_draws(opened, first_turns):
     tab = opened(first_turns)
     assert headings(tab) == ["findings", "notes", "gap", "scan", "sensitivity", "provenance"]
     answer = tab.inner_text("#answer")
@@ -148,24 +164,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
     assert tab.locator(".figure").count() == 5
     for figure in ("plan", "scan"):
         assert "QD::5" in hovered(tab, figure, "QD::5")
-
-
-def test_zoom_changes_what_is_drawn(opened, first_turns):
-    tab = opened(first_turns)
-    place = tab.locator('.figure[data-figure="data-readings"]')
-    place.scroll_into_view_if_needed()
-    shown = "place => place._fullLayout.xaxis.range"
-    before = place.evaluate(shown)
-    box = place.locator(".xy .nsewdrag, .nsewdrag").first.bounding_box()
-    tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 20)
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 25, steps=5)
-    tab.mouse.up()
-    tab.wait_for_function(
-        f"before => String(({shown})(document.querySelector("
-        "'.figure[data-figure=\"data-readings\"]'))) !== before",
-        arg=",".join(map(str, before)),
-    )
+    zoomed(tab, "readings")
 
 
 def test_a_response_has_tables_that_are_sorted_and_copied(opened, response):
@@ -225,8 +224,7 @@ def test_names_that_are_markup_are_shown_as_they_stand(opened, small_ring, tmp_p
     (tmp_path / "ring.json").write_text(json.dumps(document))
     ring = load_ring(tmp_path / "ring.json")
     weak = Cause("quadrupole_gradient", f"{name}::5", -0.02)
-    data = simulate(ring, [weak], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
-                    noise=2e-6).measurement()  # fmt: skip
+    data = shared.first_turns(ring, [weak])
     tab = opened(written(diagnose(ring, data, effects=EFFECTS), tmp_path))
     assert name in tab.inner_text("#answer")
     for figure in ("plan", "scan"):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shared import small_steps
+from shared import parted, small_steps
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import STEPS
@@ -14,7 +14,7 @@ from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import response_data
 
 GRADIENT = -0.05
 WRONG = {"QD::5": 0.003, "QF::9": -0.003, "QF::3": 0.002, "QD::12": 0.003}
@@ -44,13 +44,13 @@ def bent(combined):
         *(Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()),
     ]
     measured = small_steps(combined, causes, engine="at")
-    return response_data(combined, measured), bends, wrong
+    return parted(combined, measured, 1), bends, wrong
 
 
 def test_gradients_of_bends_are_found(bent):
     """ESRF-EBS: 96 of its magnets had none to fit; they were made up for."""
-    data, bends, wrong = bent
-    fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
+    parts, bends, wrong = bent
+    fit = fit_families(*parts, TRIALS)
     assert "bend_gradient" in [own.effect for own in fit.families if own.kept]
     assert all(error > 0 for _, error in fitted_causes(fit.state)[0])
     found = {(c.effect, c.element): c.amount for c, _ in fitted_causes(fit.state)[0]}
@@ -66,9 +66,8 @@ def test_gradients_of_bends_are_found(bent):
 
 def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
     """ALS: which family is left out hangs on the seed, and the others make up for it."""
-    data, _, _ = bent
     trials = [trial for trial in TRIALS if trial[0].name != "bend_gradient"]
-    state = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), trials).state
+    state = fit_families(*bent[0], trials).state
 
     def pull(state):
         """rms over the quadrupoles, which make up for one number together: a single pull."""
@@ -88,9 +87,7 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
 def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
     """Its bends have no gradient."""
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()]
-    measured = small_steps(small_ring, causes)
-    data = response_data(small_ring, measured)
-    fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
+    fit = fit_families(*parted(small_ring, small_steps(small_ring, causes), 1), TRIALS)
     assert not any(own.effect == "bend_gradient" for own in fit.families)
 
 

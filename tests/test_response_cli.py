@@ -1,7 +1,6 @@
-"""`simulate --kind orbit-response` and `predict`: files against the model and one another."""
+"""Simulated responses and `predict`: files against the model and one another."""
 
 import csv
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from command import tmlattice
 from conftest import SMALL
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause, load_ring, read_measurement
+from tmlattice import Cause, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.machine.response import simulate_response
@@ -71,22 +70,6 @@ def test_one_sided_steps_have_a_second_order(small_ring):
 
     assert np.abs(even(1e-5)).max() > 0
     assert_allclose(even(2e-5), 4 * even(1e-5), rtol=0.02, atol=1e-3 * np.abs(even(2e-5)).max())
-
-
-def test_command_line(tmp_path):
-    folder, truth = tmp_path / "response", tmp_path / "truth.json"
-    tmlattice(
-        "simulate", SMALL, "--kind", "orbit-response", "--engine", "ocelot", "--corrector", "v1",
-        "--corrector", "generated_a", "--seed", "1", "--out", folder,
-        "--truth", truth, "--effect", "quadrupole_gradient QF::3 0.01",
-        cwd=tmp_path, check=0,
-    )  # fmt: skip
-    measured = read_measurement(folder)
-    assert measured.correctors == ("v1", "generated_a")
-    assert measured.planes == ("y", "x")
-    assert measured.rf.orbit is not None
-    assert json.loads(truth.read_text())["effects"][0]["amount"] == 0.01
-    assert not any("QF" in file.read_text() for file in folder.iterdir())
 
 
 def test_predict_with_a_calibration(tmp_path, small_ring):

@@ -1,7 +1,5 @@
 """The ordered steps on simulated orbit responses whose errors are known, and the measured one."""
 
-import csv
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +23,6 @@ from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.noise import estimated_noise
-from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
@@ -48,8 +45,7 @@ def simulate_response(ring, causes=(), **options):
 
 
 def fitted(ring, measured, seed=1, steps=STEPS[:3]):
-    data = response_data(ring, measured)
-    return fit_families(data, split_columns(data, 0.2, np.random.default_rng(seed)), steps).state
+    return fit_families(*parted(ring, measured, seed), steps).state
 
 
 def test_the_only_corrector_of_a_plane_is_fitted(small_ring, measured):
@@ -155,35 +151,6 @@ def test_options_act_and_are_told(small_ring, measured):
         diagnose(small_ring, measured, radiation=True)
 
 
-SIGNATURES = [
-    (Cause("quadrupole_gradient", "QD::5", 0.0), 1e-4),
-    (Cause("quadrupole_offset_x", "QF::3", 0.0), 1e-5),
-    (Cause("corrector_calibration", "v5", 0.0), 1e-2),
-    (Cause("corrector_roll", "v5", 0.0), 1e-3),
-    (Cause("monitor_gain_y", "end_3", 0.0), 1e-2),
-    (Cause("monitor_roll", "end_3", 0.0), 1e-3),
-    (Cause("monitor_offset_x", "end_3", 0.0), 1e-4),
-]
-
-
-@pytest.mark.parametrize(("cause", "step"), SIGNATURES, ids=lambda v: getattr(v, "effect", ""))
-def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, cause, step):
-    """Beside calibrations, gains and gradients that are there, against whole steps both ways."""
-    there = [
-        Cause("corrector_calibration", "v5", 0.2), Cause("quadrupole_gradient", "QF::9", 0.01),
-        Cause("monitor_gain_x", "end_3", 0.1),
-    ]  # fmt: skip
-    data = response_data(small_ring, measured)
-    at = Predicted(data, Errors.none(data)).with_causes(there)
-    (mine,) = at.signatures([(cause.effect, cause.element)])
-    up, down = (at.with_causes([replace(cause, amount=h)]).read for h in (step, -step))
-    theirs = (up - down) / (2 * step)
-    # of a roll the catalogue's order of gain and roll is another: a tenth of its own gain
-    close = 0.1 if cause.effect == "monitor_roll" else 2e-3
-    assert np.abs(mine - theirs).max() <= close * np.abs(theirs).max() + 1e-12
-    assert (np.abs(theirs).max() > 1e-9) == (cause.effect != "monitor_offset_x")
-
-
 def test_what_is_missing_is_said(small_ring, measured):
     sparse = measured.select(monitors=measured.monitors[:4])
     with pytest.raises(MeasurementError, match="too few columns or BPMs determine it: state"):
@@ -275,12 +242,11 @@ def test_orbits_of_other_columns_explain_no_drift(small_ring, rng, monkeypatch):
     drift = HYPOTHESES["gradient_drift"]
 
     def scrambled(state):
-        own, draw = drift(state), np.random.default_rng(17)
-        by = draw.integers(8, 27, len(own.patterns))
-        rows = [np.roll(row, n, axis=1) for row, n in zip(own.patterns, by, strict=True)]
-        return replace(own, patterns=np.array(rows))
+        own, draw = drift.patterns(state), np.random.default_rng(17)
+        by = draw.integers(8, 27, len(own))
+        return np.array([np.roll(row, n, axis=1) for row, n in zip(own, by, strict=True)])
 
-    monkeypatch.setitem(HYPOTHESES, "scrambled", scrambled)
+    monkeypatch.setitem(HYPOTHESES, "scrambled", replace(drift, patterns=scrambled))
     state = fitted(small_ring, replace(measured, response=response))
     _, own, other = weigh(state, ["gradient_drift", "scrambled"])
     assert [own.judgement, other.judgement] == ["helps", "excluded"]
@@ -364,41 +330,6 @@ def test_more_energy_spread_than_a_beam_has_is_refused(small_ring):
     assert [step.effect for step in found.steps] == ["design"]
     assert [(own.effect, own.kept) for own in found.families] == [("energy_spread", False)]
     assert any("where radiation makes 0.11 %" in said for said in found.warnings)
-
-
-def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path, small_ring):
-    beam = [Cause("energy_spread", None, 1.2e-3), Cause("energy_offset", None, -2e-3)]
-    measured = simulate_response(
-        small_ring, [*CAUSES, *beam], kick=1e-5, noise=2e-8, engine="ocelot", progress=False,
-        seed=3,
-    ).measured  # fmt: skip
-    write_measurement(tmp_path / "m", measured)
-    ring, out, told = (tmp_path / name for name in ("ring.json", "predicted.csv", "found.json"))
-    calibration = tmp_path / "ring.json.calibration.json"
-    effects = ",".join([*KNOWN, *(cause.effect for cause in beam)])
-    tmlattice("diagnose", SMALL, "m", "--lattice-out", ring, "--json", told,
-              "--effects", effects, cwd=tmp_path, check=0)  # fmt: skip
-    tmlattice("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5",
-              cwd=tmp_path, check=0)  # fmt: skip
-    written = {
-        own["effect"]: own["amount"] for own in json.loads(calibration.read_text())["effects"]
-    }
-    for cause in beam:
-        assert abs(written[cause.effect] - cause.amount) < 0.1 * abs(cause.amount)
-    figure = json.loads(told.read_text())["steps"][-1]["heldout_rms_in_plane"]
-    with out.open(encoding="utf-8") as table:
-        rows = {(row["corrector"], row["monitor"]): row for row in csv.DictReader(table)}
-    # the same judges as the diagnosis had: the kick from one half of the monitors
-    data, split = parted(small_ring, measured)
-    left = []
-    for c in np.flatnonzero(split.held):
-        name, plane = data.measured.correctors[c], data.measured.planes[c]
-        own = [rows[small_ring[name].name, m] for m in data.measured.monitors]
-        model = np.array([float(row[plane]) for row in own])
-        read, near = data.pick(data.orbits)[c], split.half[c]
-        kick = model[near] @ read[near] / (model[near] @ model[near])
-        left.append((read - kick * model)[~near])
-    assert np.isclose(np.sqrt(np.mean(np.square(left))), figure, rtol=0.05)  # the third order
 
 
 def test_options_that_have_no_meaning(tmp_path, measured):

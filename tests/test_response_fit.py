@@ -18,7 +18,6 @@ from tmlattice.inference import normal as blocks
 from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.response_data import response_data, split_columns
 
 
 @pytest.fixture
@@ -49,20 +48,6 @@ def written_out(residual, weight, plane, u, v, ring):
     return np.array(rows)
 
 
-def test_fit_vs_dense_least_squares(problem, rng):
-    residual, weight, *_ = problem
-    X = written_out(*problem)
-    size = X.shape[1]
-    start = 0.05 * rng.standard_normal(size)
-    rms = np.concatenate([np.full(18, 0.3), np.full(12, 0.2), np.full(7, 0.1)])
-    group = Group("all", np.eye(size), 1.0, each=rms)
-    found = solve(normal_equations(*problem), [group], start, rounds=0)
-    w, y = weight.ravel(), np.nan_to_num(residual.ravel()) + X @ start
-    matrix = X.T @ (w[:, None] * X) + np.diag(rms**-2)
-    assert_allclose(found.values, np.linalg.solve(matrix, X.T @ (w * y)), atol=1e-9)
-    assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-7)
-
-
 def test_normal_equations_of_several_families_in_several_pieces(problem, rng, monkeypatch):
     """Two or five columns at once, the last piece shorter; slopes of one family are old ones."""
     residual, weight, plane, u, v, [whole] = problem
@@ -78,18 +63,21 @@ def test_normal_equations_of_several_families_in_several_pieces(problem, rng, mo
         assert_allclose(normal.vector, right, rtol=1e-12, atol=1e-8)
 
 
-def test_a_family_shares_its_error_vs_a_correlated_prior(problem):
-    """Members and their family: the prior's covariance is D + t^2 of ones."""
+def test_fit_vs_dense_least_squares_with_a_correlated_prior(problem, rng):
+    """Members, each of its own rms, and their family: the covariance is D + t^2 of ones."""
     X = written_out(*problem)
     residual, weight, *_ = problem
     size = X.shape[1]
-    own = Group("own", np.eye(size), 0.1)
+    start = 0.05 * rng.standard_normal(size)
+    rms = np.concatenate([np.full(18, 0.3), np.full(12, 0.2), np.full(7, 0.1)])
+    own = Group("own", np.eye(size), 1.0, each=rms)
     family = np.zeros((size, 1))
     family[-7:] = 1
-    found = solve(normal_equations(*problem), [own, Group("family", family, 0.5)], rounds=0)
-    prior = 0.1**2 * np.eye(size) + 0.5**2 * family @ family.T
+    groups = [own, Group("family", family, 0.5)]
+    found = solve(normal_equations(*problem), groups, start, rounds=0)
+    prior = np.diag(rms**2) + 0.5**2 * family @ family.T
     matrix = X.T @ (weight.ravel()[:, None] * X) + np.linalg.inv(prior)
-    right = X.T @ (weight.ravel() * np.nan_to_num(residual.ravel()))
+    right = X.T @ (weight.ravel() * (np.nan_to_num(residual.ravel()) + X @ start))
     assert_allclose(found.values, np.linalg.solve(matrix, right), atol=1e-9)
     assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-6)
 
@@ -151,10 +139,7 @@ def test_gains_of_little_information_come_in(small_ring):
         for plane in "xy"
     ]
     measured = small_steps(small_ring, causes, noise=4e-6, seed=3)
-    data = response_data(small_ring, measured)
-    fit = hierarchical.fit_families(
-        data, split_columns(data, 0.2, np.random.default_rng(1)), STEPS[:3]
-    )
+    fit = hierarchical.fit_families(*parted(small_ring, measured, 1), STEPS[:3])
     assert {own.effect.split(",")[0] for own in fit.families if own.kept} == {
         "monitor_gain_x", "quadrupole_gradient"
     }  # fmt: skip

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from shared import parted, small_steps
 
+from tests.scenarios import moved as jittery
+from tests.scenarios import swapped_correctors, swapped_monitors
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.hierarchical import fit_families, taken_back
@@ -14,7 +16,7 @@ from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import response_data
 
 WITH_ROLLS = {"corrector_calibration", "monitor_gain", "quadrupole_gradient", "monitor_roll",
               "corrector_roll"}  # fmt: skip
@@ -28,8 +30,7 @@ def clean(small_ring):
 
 
 def fitted(ring, measured):
-    data, split = parted(ring, measured, 1)
-    return fit_families(data, split, [STEPS[0], STEPS[2]]).state
+    return fit_families(*parted(ring, measured, 1), [STEPS[0], STEPS[2]]).state
 
 
 def error(state):
@@ -69,18 +70,12 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
     measured = small_steps(ring, causes, noise=noise, seed=3)
     moves, rests = "xy".index(plane), "yx".index(plane)
-    orbit = measured.response[measured.planes.index(plane), :, moves].copy()
-    orbit *= times * noise / np.sqrt(np.mean(orbit**2))
-    amounts = np.random.default_rng(5).standard_normal(len(measured.correctors) + 1)
-    moved, rf = measured.response.copy(), measured.rf.orbit.copy()
-    moved[:, :, moves] += amounts[:-1, None] * orbit
-    rf[:, moves] += amounts[-1] * orbit
-    moved = replace(measured, response=moved, rf=replace(measured.rf, orbit=rf))
+    moved = jittery(moves, times)(measured, np.random.default_rng(5))
+    orbits = (moved.response - measured.response)[..., moves]
     steps = [step for step in STEPS if step[0].name in WITH_ROLLS]
 
     def found(response):
-        data = response_data(ring, response)
-        return fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        return fit_families(*parted(ring, response, 1), steps)
 
     still, told = found(measured), found(moved)
     assert still.state.jitter is None
@@ -90,10 +85,10 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     patterns = told.state.jitter[moves]
     assert not told.state.jitter[rests].any()
     # alike at all monitors, and as large: fifteen columns know their rms to a fifth
-    missed = np.linalg.lstsq(patterns.T, orbit, rcond=None)[0] @ patterns - orbit
-    assert np.sqrt(np.mean(missed**2)) < 0.02 * np.sqrt(np.mean(orbit**2))
+    missed = np.linalg.lstsq(patterns.T, orbits[0], rcond=None)[0] @ patterns - orbits[0]
+    assert np.sqrt(np.mean(missed**2)) < 0.02 * np.sqrt(np.mean(orbits[0] ** 2))
     size = np.sqrt(np.mean((patterns**2).sum(axis=0)))
-    assert size == pytest.approx(np.sqrt(np.mean(amounts**2)) * times * noise, rel=0.4)
+    assert size == pytest.approx(np.sqrt(np.mean(orbits**2)), rel=0.4)
     assert error(told.state) < 1.3 * error(still.state)
     # the RF's other BPMs are predicted with the jitter that its fitted ones show
     assert told.steps[-1].dispersion_rms < 3 * still.steps[-1].dispersion_rms
@@ -102,27 +97,16 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
         assert error(found(moved).state) > 10 * error(told.state)
 
 
-def swapped(measured, what, pair):
-    """The measurement with the readings of two correctors, or of two monitors, exchanged."""
-    names = list(getattr(measured, what))
-    order = np.arange(len(names))
-    order[[names.index(own) for own in pair]] = [names.index(own) for own in reversed(pair)]
-    if what == "correctors":
-        return replace(measured, response=measured.response[order])
-    rf = replace(measured.rf, orbit=measured.rf.orbit[order])
-    return replace(measured, response=measured.response[:, order], rf=rf)
-
-
-EXCHANGED = {"neighbours": ("correctors", "v5", "v6"), "monitors": ("monitors", "end_1", "end_14")}
-
-
-@pytest.mark.parametrize("case", EXCHANGED)
-def test_what_is_exchanged_is_the_finding(small_ring, case):
+@pytest.mark.parametrize(
+    ("what", "swapped", "pair"),
+    [
+        ("correctors", swapped_correctors, ("v5", "v6")),  # neighbours
+        ("BPMs", swapped_monitors, ("end_1", "end_14")),
+    ],
+)
+def test_what_is_exchanged_is_the_finding(small_ring, rng, what, swapped, pair):
     """A ring without another fault had been told to have no error; whatever effects are asked."""
-    what, *pair = EXCHANGED[case]
-    measured = small_steps(small_ring, seed=3)
-    wrong = swapped(measured, what, pair)
-    what = "BPMs" if what == "monitors" else what
+    wrong = swapped(*pair)(small_steps(small_ring, seed=3), rng)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
     (one,) = found.findings
@@ -135,7 +119,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     gain = np.nansum((own.orbits - model) ** 2) / noise**2 - 2 * np.isfinite(own.orbits).sum()
     assert 0.2 * gain < one.detection.statistic < 1.1 * gain
     places = [small_ring[name].s for name in pair]
-    if case == "neighbours":
+    if what == "correctors":
         assert one.where[0] < min(places) < max(places) < one.where[1]
     else:
         assert any(one.where[0] <= s <= one.where[1] for s in places)

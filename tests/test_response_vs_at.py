@@ -86,13 +86,6 @@ def test_the_third_order_of_two_sided_steps_vs_at(model, engine):
     assert_allclose(up - down, theirs[:, 0] - theirs[:, 1], atol=2e-8)
 
 
-def test_finite_steps_settle_to_the_derivative(model):
-    names = [model.correctors[i] for i in SOME]
-    up, down = (model.closed_orbits(names, np.full(len(names), h)) for h in (1e-6, -1e-6))
-    scale = np.abs(model.response(names)).max()
-    assert_allclose((up - down) / 2e-6, model.response(names), atol=1e-5 * scale)
-
-
 def test_a_corrector_that_is_rolled_kicks_by_its_turned_kick_too(petra3, model):
     """Against the maps of a ring with rolled correctors, in both planes."""
     names, angle = [model.correctors[i] for i in SOME], 0.1

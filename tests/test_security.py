@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from command import tmlattice
+from command import printed, tmlattice
 from conftest import SMALL
 
 from tmlattice import cache, load_ring
@@ -95,9 +95,13 @@ def test_the_cache_is_this_user_s_alone(kept):
 
 def test_a_lattice_is_kept_by_a_fresh_installation(open_folder):
     """Modules that are compiled while it is read may warn."""
-    words = [sys.executable, "-X", f"pycache_prefix={open_folder}/compiled", "-m", "tmlattice"]
-    own = os.environ | {"TMLATTICE_CACHE": str(open_folder)}
-    subprocess.run([*words, "info", SMALL], env=own, check=True, capture_output=True)
+    code = (  # not the libraries that warn of nothing, which takes longest
+        "import sys, numpy, scipy.linalg, numba, click\n"
+        f"sys.pycache_prefix = {str(open_folder / 'compiled')!r}\n"
+        "from tmlattice.cli.command import main\n"
+        "main()\n"
+    )
+    printed("-c", code, "info", SMALL, cwd=open_folder, TMLATTICE_CACHE=open_folder)
     assert list((open_folder / "tmlattice").iterdir())
 
 
@@ -190,11 +194,7 @@ def test_a_user_without_a_name_or_a_home_can_work(open_folder, beside):
         copy(beside / name, open_folder / name)
     ring, data = open_folder / "ring.json", open_folder / "M"
     words = ("diagnose", ring, data, "--effects", "quadrupole_gradient", "--out", "R", "-q")
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", TWICE, *words], cwd=open_folder, capture_output=True,
-        text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    printed("-P", "-c", TWICE, *words, cwd=open_folder)
     assert (open_folder / "his" / "R" / "report.html").stat().st_uid == OTHER
     assert os.listdir(open_folder / "his") == ["R"]
 
@@ -255,29 +255,22 @@ COMPILED = (
 def test_compiled_kernels_are_read_from_no_folder_that_data_name(tmp_path):
     """They are code: numba would take the folder from a file in the working directory."""
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: beside\n")
-    named = {**os.environ, "TMLATTICE_CACHE": str(tmp_path / "kept")}
-    named.pop("NUMBA_CACHE_DIR", None)
-    told, where = python(COMPILED, tmp_path, named).split()
+
+    def compiled(folder):
+        kept = {"TMLATTICE_CACHE": tmp_path / "kept", "NUMBA_CACHE_DIR": folder}
+        return printed("-P", "-c", COMPILED, cwd=tmp_path, **kept).split()
+
+    told, where = compiled(None)
     assert told == "-"
     assert "beside" not in where
     assert not (tmp_path / "beside").exists()
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
-    told, where = python(COMPILED, tmp_path, {**named, "NUMBA_CACHE_DIR": "open"}).split()
-    assert told == "-"
+    assert compiled("open")[0] == "-"
     (tmp_path / "own").mkdir(0o700)
-    told, where = python(COMPILED, tmp_path, {**named, "NUMBA_CACHE_DIR": "own"}).split()
+    told, where = compiled("own")
     assert told == "own"
     assert Path(where).parts[0] == "own"
-
-
-def python(code, folder, environment=None):
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=folder, env=environment or os.environ,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 MODULES = (

@@ -2,16 +2,14 @@
 
 import importlib
 import pkgutil
-import subprocess
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from command import printed
 from conftest import SMALL
-from shared import valid
 
 import tmlattice
 from tmlattice.effects import CATALOGUE
@@ -108,16 +106,6 @@ def test_names_of_a_file_do_not_become_tags(small_ring):
     assert "<script>" not in replace(small_ring, name="<script>")._repr_html_()
 
 
-def test_a_diagnosis_writes_what_the_command_writes(diagnosis, tmp_path):
-    assert diagnosis.save(tmp_path / "out") == tmp_path / "out" / "report.html"
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names >= {"report.html", "report.txt", "diagnosis.json", "scan.png", "gap.png"}
-    valid(tmp_path / "out" / "diagnosis.json", "diagnosis")
-    assert (tmp_path / "out" / "report.txt").read_text() == diagnosis.report() + "\n"
-    assert "QD::5" in diagnosis.report(80)
-    assert max(map(len, diagnosis.report(80).splitlines())) <= 80
-
-
 def test_objects_draw_themselves(small_ring, measured, diagnosis):
     before = len(plt.get_fignums())
     scan, gap, betas = diagnosis.plot(), diagnosis.plot("gap"), small_ring.plot(span=(0, 50))
@@ -204,7 +192,7 @@ def test_every_room_is_there_after_import():
         "for name in tmlattice.__all__: getattr(tmlattice, name)\n"
         "assert {'plots', 'diagnose'} <= set(dir(tmlattice))\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    printed("-c", code, cwd=".")
 
 
 def test_what_a_room_names_above_itself_is_there():

@@ -5,8 +5,8 @@ import json
 import os
 import shutil
 import sys
-import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 import numpy as np
@@ -50,7 +50,7 @@ LOADED = (
 
 def test_a_second_info_loads_neither_ocelot_nor_torch_and_says_the_same(tmp_path):
     def info(name):
-        out = python(LOADED, tmp_path, "info", "petra3", "--json", name)
+        out = python(LOADED, tmp_path, "info", SMALL, "--json", name)
         return json.loads((tmp_path / name).read_text()), out.partition("loaded:")
 
     cold, (said_cold, _, _) = info("cold.json")
@@ -277,11 +277,8 @@ def test_many_writers_never_leave_a_torn_entry(tmp_path, monkeypatch):
             if cache.load(name, bytes) not in contents:
                 wrong.append(k)
 
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(work, range(4)))
     assert not wrong
     assert [path.name for path in (tmp_path / "tmlattice").iterdir()] == [name]
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from tests.scenarios import ring_of
 from tmlattice import Cause, diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.stored import StoredBeam
+from tmlattice.beam.stored import NO_RF, StoredBeam
 from tmlattice.effects import CATALOGUE, RingEffect, apply, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
@@ -28,11 +28,6 @@ WRONG = [
 
 
 LOSS = Cause("radiation_loss_bends", None, 0.8)
-
-
-@pytest.fixture(scope="module")
-def wrong(small_ring):
-    return apply(small_ring, WRONG)
 
 
 @pytest.fixture(scope="module")
@@ -61,25 +56,23 @@ def _hypotheses(ring):
             yield from ((name, place) for place in places[:: max(len(places) // 2, 1)][:2])
 
 
-def test_every_effect_vs_differences(wrong):
-    _check_derivatives(wrong, lambda ring: StoredBeam(ResponseModel(ring)))
-
-
-def test_every_effect_vs_differences_where_the_rf_is_felt(with_cavities):
-    ring = apply(with_cavities, [*WRONG, LOSS])
-    felt = cavities_of(with_cavities, ResponseModel(ring))
-    assert len(felt.exits) == 2
-    _check_derivatives(ring, lambda ring: StoredBeam(ResponseModel(ring), felt))
-
-
-def _check_derivatives(wrong, beam_of):
-    hypotheses = list(_hypotheses(wrong))
+@pytest.mark.parametrize("rf_is_felt", [False, True])
+def test_every_effect_vs_differences(small_ring, with_cavities, rf_is_felt):
+    ring, felt = apply(small_ring, WRONG), NO_RF
+    if rf_is_felt:
+        ring = apply(with_cavities, [*WRONG, LOSS])
+        felt = cavities_of(with_cavities, ResponseModel(ring))
+        assert len(felt.exits) == 2
+    hypotheses = list(_hypotheses(ring))
     assert len(hypotheses) > 30
-    beam = beam_of(wrong)
+    beam = StoredBeam(ResponseModel(ring), felt)
     moved = beam.moved(hypotheses)
     for i, (name, place) in enumerate(hypotheses):
         step = 1e-4 * find(name).largest
-        up, down = (beam_of(apply(wrong, [Cause(name, place, side * step)])) for side in (1, -1))
+        up, down = (
+            StoredBeam(ResponseModel(apply(ring, [Cause(name, place, side * step)])), felt)
+            for side in (1, -1)
+        )
         orbit = (up.model.readings - down.model.readings) / (2 * step)
         tunes = (up.tunes - down.tunes) / (2 * step)
         modes = (up.modes - down.modes) / (2 * step)

@@ -108,6 +108,15 @@ def test_a_diagnosis_refuses_what_is_wrong_everywhere(small_ring, sound):
         diagnose(small_ring, {"tunes": sound["tunes"], "dispersion": flipped})
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_diagnosis_repeats_what_its_checks_noted(small_ring, sound, kind):
+    data = replace(sound[kind], energy=1.2 * small_ring.energy)
+    found = diagnose(small_ring, data, effects=["quadrupole_gradient"])
+    note = next(one.sentence for one in check_data(small_ring, data).reported)
+    assert "energy" in note
+    assert any(note in warning for warning in found.warnings)
+
+
 def test_another_ring(small_ring, sound):
     """Monitors in no order at all are those of no ring that is known here."""
     mixed = np.random.default_rng(1).permutation(len(small_ring.monitors))

@@ -37,26 +37,26 @@ def round_trip(tmp_path, measured):
 quick = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 
 
+def dispersion(orbits, noise):
+    steps = [RfStep(499664399.423, 3840, *own) for own in zip((-300.0, 250.0), orbits, strict=True)]
+    return Dispersion(tuple(steps), MONITORS, noise, **hints)
+
+
+@pytest.mark.parametrize(
+    ("shape", "make"),
+    [
+        ((2, 16, 3, 2), lambda *r: TurnByTurn(r[0], MONITORS, r[1], SETTINGS, (3, 1), **hints)),
+        ((2, 3, 2), lambda *r: ClosedOrbit(r[0], MONITORS, r[1], SETTINGS, (3, 1), **hints)),
+        ((2, 3, 2), dispersion),
+    ],
+    ids=["turns", "closed orbits", "dispersion"],
+)
 @quick
-@given(arrays(float, (2, 16, 3, 2), elements=reading), noises)
-def test_turns_read_back_bit_by_bit(tmp_path, readings, noise):
-    readings[1, 15, 0, 0] = 1e-3
-    round_trip(tmp_path, TurnByTurn(readings, MONITORS, noise, SETTINGS, (3, 1), **hints))
-
-
-@quick
-@given(arrays(float, (2, 3, 2), elements=reading), noises)
-def test_closed_orbits_read_back_bit_by_bit(tmp_path, orbit, noise):
-    orbit[1, 2, 1] = 1e-3
-    round_trip(tmp_path, ClosedOrbit(orbit, MONITORS, noise, SETTINGS, (3, 1), **hints))
-
-
-@quick
-@given(arrays(float, (2, 3, 2), elements=reading), noises)
-def test_dispersion_reads_back_bit_by_bit(tmp_path, orbits, noise):
-    orbits[1, 2, 1] = 1e-3
-    steps = [RfStep(499664399.423, 3840, s, o) for s, o in zip((-300.0, 250.0), orbits)]  # noqa: B905
-    round_trip(tmp_path, Dispersion(tuple(steps), MONITORS, noise, **hints))
+@given(st.data())
+def test_readings_are_read_back_bit_by_bit(tmp_path, shape, make, data):
+    readings = data.draw(arrays(float, shape, elements=reading))
+    readings.flat[-1] = 1e-3
+    round_trip(tmp_path, make(readings, data.draw(noises)))
 
 
 @pytest.mark.parametrize("chromaticity", [None, [[1.5, -2.0], [math.nan, 3.0]]])

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from command import tmlattice
+from command import refused, tmlattice
 from conftest import SMALL
 from shared import valid
 
@@ -95,5 +95,4 @@ def test_table_json_and_figure(system, tmp_path):
 
 
 def test_an_unknown_system_is_refused(tmp_path):
-    done = tmlattice("dev", "reproduce", "pendulums", cwd=tmp_path, check=2)
-    assert "pendulum" in done.stderr
+    refused("dev", "reproduce", "pendulums", cwd=tmp_path, says="'pendulum'")

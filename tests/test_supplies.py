@@ -124,7 +124,7 @@ def test_derivatives_of_a_changed_ring(ring, k1):
     fresh = by_hypothesis(directions(LayerMaps(there, 6), HYPOTHESES))
     nearby = by_hypothesis(directions_nearby(layers.changed_to(there)[0], HYPOTHESES))
     settings = {"QFm3r": {"k1_relative": k1 / ring["QFm3r"].k1 - 1}}
-    shots = Group(0, np.zeros(1, dtype=int), settings, False, assembly(ring, (), 6))
+    shots = Group(0, np.zeros(1, dtype=int), settings, assembly(ring, (), 6))
     for found in (nearby, by_hypothesis(shots.directions(HYPOTHESES))):
         for hypothesis in HYPOTHESES:
             if k1 == 0 and hypothesis[1] == "QFm3r":

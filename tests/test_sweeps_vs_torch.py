@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from tmlattice import TaylorNetwork
-from tmlattice.beam import sweeps
 from tmlattice.errors import BeamLostError
 from tmlattice.network import plain_readings
 
@@ -20,32 +19,28 @@ def dense(network, rng, size=1e-3):
     return copy
 
 
+def assert_as_plain(network, launch, rng):
+    """Readings, and gradients of a random sum of them, are those of the plain loop."""
+    launch.requires_grad_()
+    mine, plain = network(launch), plain_readings(network, launch)
+    assert (mine - plain).abs().max() <= 1e-13 * plain.abs().max()
+    pull = torch.from_numpy(rng.standard_normal(tuple(mine.shape)))
+    wanted = [launch, *network.parameters()]
+    got, expected = (torch.autograd.grad((x * pull).sum(), wanted) for x in (mine, plain))
+    for one, other in zip(got, expected, strict=True):
+        assert (one - other).abs().max() <= 1e-10 * other.abs().max()
+
+
 @pytest.mark.parametrize("batch", [1, 2, 16, 17, 70, 130])  # every width of block, full and not
 @pytest.mark.parametrize("dimension", [4, 6])
 def test_values_and_gradients_match_the_plain_loop(short_ring, batch, dimension, rng):
     network = dense(TaylorNetwork.from_ring(short_ring, dimension), rng)
-    launch = torch.from_numpy(1e-4 * rng.standard_normal((batch, dimension)))
-    launch.requires_grad_()
-    mine, plain = network(launch), plain_readings(network, launch)
-    scale = plain.abs().max()
-    assert (mine - plain).abs().max() <= 1e-13 * scale
-    pull = torch.from_numpy(rng.standard_normal(tuple(mine.shape)))
-    wanted = [launch, *network.parameters()]
-    got = torch.autograd.grad((mine * pull).sum(), wanted)
-    expected = torch.autograd.grad((plain * pull).sum(), wanted)
-    for one, other in zip(got, expected, strict=True):
-        assert (one - other).abs().max() <= 1e-10 * other.abs().max()
+    assert_as_plain(network, torch.from_numpy(1e-4 * rng.standard_normal((batch, dimension))), rng)
 
 
 def test_values_and_gradients_match_on_the_whole_ring(petra3_network, rng):
     launch = torch.from_numpy(1e-3 * rng.standard_normal((2, 4)) * [1, 0.05, 1, 0.05])
-    mine, plain = petra3_network(launch), plain_readings(petra3_network, launch)
-    assert (mine - plain).abs().max() <= 1e-13
-    weights = list(petra3_network.parameters())
-    got = torch.autograd.grad(mine.square().sum(), weights)
-    expected = torch.autograd.grad(plain.square().sum(), weights)
-    for one, other in zip(got, expected, strict=True):
-        assert (one - other).abs().max() <= 1e-10 * other.abs().max()
+    assert_as_plain(petra3_network, launch, rng)
 
 
 def test_a_layer_that_bends_only_slightly_is_not_skipped(small_network, rng):
@@ -96,11 +91,6 @@ def test_lost_beam_is_named_by_its_layer(small_network):
 def test_launch_of_another_shape_is_refused(small_network, launch):
     with pytest.raises(ValueError, match="should be"):
         small_network(launch)
-
-
-def test_packing_is_undone(rng):
-    rows = rng.standard_normal((37, 5, 2))
-    np.testing.assert_array_equal(sweeps.unpack(sweeps.pack(rows, 16), 37), rows)
 
 
 def test_result_does_not_depend_on_the_number_of_threads(small_network, monkeypatch, rng):

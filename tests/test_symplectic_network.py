@@ -69,11 +69,6 @@ def test_tunes_are_those_of_the_design(petra3_network):
     np.testing.assert_allclose(mine.tunes, theirs.tunes, atol=1e-11)
 
 
-def actions(network, states):
-    z = np.abs(one_turn_optics(network).normalised(states)) ** 2
-    return z  # [turn, 2]
-
-
 def drift(network, turns):
     """Change of the mean action from the first tenth of the turns to the last, relative, (x, y)."""
     launch = np.array([[3e-3, 0, 0, 0], [0, 0, 3e-3, 0]])
@@ -81,8 +76,8 @@ def drift(network, turns):
     tenth = turns // 10
     changes = []
     for plane in range(2):
-        z = actions(network, states[plane])[:, plane]
-        changes.append(abs(z[-tenth:].mean() / z[1 : tenth + 1].mean() - 1))
+        action = np.abs(one_turn_optics(network).normalised(states[plane])[:, plane]) ** 2
+        changes.append(abs(action[-tenth:].mean() / action[1 : tenth + 1].mean() - 1))
     return np.array(changes)
 
 

@@ -130,9 +130,6 @@ def test_free_fall_is_the_derivatives_of_the_hyperbolic_tangent():
     np.testing.assert_allclose(W0, [50 * np.tanh(a)], rtol=1e-14)
     np.testing.assert_allclose(W1, [[1 / np.cosh(a) ** 2]], rtol=1e-14)
     np.testing.assert_allclose(W2, [[-np.tanh(a) / np.cosh(a) ** 2 / 50]], rtol=1e-13)
-    assert abs(W0[0] - 0.979874527) < 5e-10
-    assert abs(W1[0, 0] - 0.999615938) < 5e-10
-    assert abs(W2[0, 0] + 3.91799e-4) < 5e-10  # the paper prints -3.842686e-4: a misprint
 
 
 def test_ideal_pendulum_has_the_printed_map():
@@ -180,24 +177,6 @@ def test_a_hamiltonian_flow_is_symplectic_up_to_its_order():
     for part in defect[:5]:
         assert np.abs(part).max() < 1e-11
     assert np.abs(defect[6]).max() > 1e-6
-
-
-def test_coefficients_of_time_against_closed_solutions():
-    t0, t = 0.4, 1.1
-    grows = (t**2 - t0**2) / 2  # x' = t x^2: x / (1 - x (t^2 - t0^2) / 2)
-    W = taylor_map_of_ode({(2,): lambda t: [t]}, 5, t - t0, start=t0).coefficients
-    np.testing.assert_allclose([w.item() for w in W[1:]], grows ** np.arange(5), rtol=1e-11)
-    driven = {(0,): lambda t: [np.cos(3 * t)], (1,): [0.0]}
-    W0 = taylor_map_of_ode(driven, 1, t - t0, start=t0).coefficients[0]
-    np.testing.assert_allclose(W0, [(np.sin(3 * t) - np.sin(3 * t0)) / 3], rtol=1e-11)
-
-
-def test_the_two_solvers_agree():
-    terms = random_terms(5, 3, 3, constant=0.3)
-    frozen = {e: (lambda t, c=c: c) for e, c in terms.items()}
-    series, integrated = (taylor_map_of_ode(x, 4, 0.6) for x in (terms, frozen))
-    for one, other in zip(series.coefficients, integrated.coefficients, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11 * np.abs(one).max())
 
 
 @pytest.mark.parametrize(("n", "order"), [(2, 10), (6, 4)])

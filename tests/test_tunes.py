@@ -44,19 +44,15 @@ def test_amplitude_of_the_line_is_the_action():
     x, px = states[0, 0, :2]
     action = np.sqrt((x**2 + (12.0 * px - 0.7 * x) ** 2) / 12.0)
     optics = Optics(np.zeros(2), normal_modes(matrix)[1], np.zeros(4))
-    z = optics.normalised(states[0, 0])[0]  # x_N - i p_N
-    np.testing.assert_allclose(z, (x - 1j * (12.0 * px - 0.7 * x)) / np.sqrt(12.0), rtol=1e-12)
+    y, py = states[0, 0, 2:]
+    normalised = [  # x_N - i p_N, of beta and alpha as they are in `signal`
+        (x - 1j * (12.0 * px - 0.7 * x)) / np.sqrt(12.0),
+        (y - 1j * (4.0 * py + 1.3 * y)) / np.sqrt(4.0),
+    ]
+    np.testing.assert_allclose(optics.normalised(states[0, 0]), normalised, rtol=1e-12)
     for method, tolerance in (("naff", 1e-3), ("fft", 1e-3)):
         found = tunes(states, optics, method).amplitude[0, 0]
         np.testing.assert_allclose(found, action, rtol=tolerance)
-
-
-def test_twiss_of_a_known_matrix():
-    matrix, _ = signal(0.1236, 0.2747)
-    _, vectors = normal_modes(matrix)
-    np.testing.assert_allclose(np.abs(vectors[0, 0]) ** 2, 12.0)
-    np.testing.assert_allclose(np.abs(vectors[2, 1]) ** 2, 4.0)
-    np.testing.assert_allclose(-np.real(vectors[0, 0].conj() * vectors[1, 0]), -0.7)
 
 
 @pytest.mark.parametrize("growth", [0.9, 0.99, 1.05])

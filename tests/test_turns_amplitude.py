@@ -165,20 +165,22 @@ def test_a_quadrupole_is_found_at_a_large_amplitude(small_ring):
     assert found.findings[0].element == "QD::3"
 
 
-def test_an_amplitude_beyond_second_order_is_reported():
+@pytest.fixture(scope="module")
+def hmba():
     with pytest.warns(UserWarning, match="octupoles"):
-        ring = load_ring(SHIPPED / "hmba.mat", correctors="SH*")
-    turns = simulate_turns(ring, amplitude=2e-3, turns=256, seed=0).measured
+        return load_ring(SHIPPED / "hmba.mat", correctors="SH*")
+
+
+def test_an_amplitude_beyond_second_order_is_reported(hmba):
+    turns = simulate_turns(hmba, amplitude=2e-3, turns=64, seed=0).measured
     with pytest.raises(MeasurementError, match=r"an oscillation of 2 mm rms is too large"):
-        diagnose(ring, turns)
+        diagnose(hmba, turns)
 
 
-def test_the_next_order_of_a_shift_is_no_quadrupole_family():
+def test_the_next_order_of_a_shift_is_no_quadrupole_family(hmba):
     """Its pattern repeats in the cells of the ring, as the effect of a family does: 0.013 % of qd5b
     were found where it counted as independent errors of the BPMs."""
-    with pytest.warns(UserWarning, match="octupoles"):
-        ring = load_ring(SHIPPED / "hmba.mat", correctors="SH*")
-    turns = simulate_turns(ring, amplitude=1e-3, seed=5).measured
-    found = diagnose(ring, turns, effects=["family_gradient", "quadrupole_gradient"], seed=5)
+    turns = simulate_turns(hmba, amplitude=1e-3, seed=5).measured
+    found = diagnose(hmba, turns, effects=["family_gradient", "quadrupole_gradient"], seed=5)
     assert found.verdict == "none"
     assert found.fit_before.chi2_per_dof < 1.1

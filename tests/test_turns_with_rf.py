@@ -62,27 +62,32 @@ def test_without_its_rf_the_model_is_far_from_at(small_ring):
     assert rms(np.stack(each, axis=1) - at) > 100
 
 
-@pytest.mark.parametrize(("radiation", "settings"), [(True, {}), (False, FREQUENCY)])
-def test_a_faultless_ring_is_faultless_over_several_turns(small_ring, radiation, settings):
-    measured = simulate(
-        small_ring, [], shots=4, amplitude=1e-4, turns=TURNS, radiation=radiation,
-        settings=[settings] * 4, seed=1,
-    ).measurement()  # fmt: skip
-    result = diagnose(small_ring, measured, radiation=radiation)
+@pytest.fixture(params=[(True, {}), (False, FREQUENCY)])
+def found(small_ring, request):
+    """A function that diagnoses turns of the small ring, with radiation or another frequency."""
+    radiation, settings = request.param
+
+    def diagnosed(causes, amplitude):
+        measured = simulate(
+            small_ring, causes, shots=4, amplitude=amplitude, turns=TURNS, radiation=radiation,
+            settings=[settings] * 4, seed=1,
+        ).measurement()  # fmt: skip
+        return diagnose(small_ring, measured, radiation=radiation)
+
+    return diagnosed
+
+
+def test_a_faultless_ring_is_faultless_over_several_turns(found):
+    result = found([], 1e-4)
     assert result.verdict == "none"
     # 560 readings of three shots: chi-square per reading is 1 within 0.06, and four of that
     assert abs(result.fit_after.chi2_per_dof - 1) < 0.2
     assert not result.causes
 
 
-@pytest.mark.parametrize(("radiation", "settings"), [(True, {}), (False, FREQUENCY)])
-def test_a_fault_is_named_over_several_turns(small_ring, radiation, settings):
+def test_a_fault_is_named_over_several_turns(found):
     cause = Cause("quadrupole_gradient", "QF::3", -0.1)
-    measured = simulate(
-        small_ring, [cause], shots=4, amplitude=5e-4, turns=TURNS, radiation=radiation,
-        settings=[settings] * 4, seed=1,
-    ).measurement()  # fmt: skip
-    result = diagnose(small_ring, measured, radiation=radiation)
+    result = found([cause], 5e-4)
     assert [(f.effect, f.element) for f in result.findings] == [(cause.effect, cause.element)]
     assert abs(result.causes[0].amount - cause.amount) < 4 * result.findings[0].amount_sigma
 
@@ -165,3 +170,28 @@ def test_a_lost_beam_states_shot_turn_and_magnet(small_ring):
         there = s[found.element] + found.turn * small_ring.length
         assert before <= there <= first
         assert found.element in str(found)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "turns", "causes"),
+    [
+        (4, 1, [Cause("quadrupole_gradient", "QD::5", -0.1)]),
+        (4, 2, []),
+        (6, 1, [Cause("energy_spread", None, 2e-3)]),
+        (6, TURNS, [Cause("energy_offset", None, 1e-3), *RADIATION]),
+    ],
+)
+def test_positions_along_the_trajectories_are_the_beams(with_cavities, dimension, turns, causes):
+    """Read from trajectories with their derivatives, and tracked: shots of two settings, a kick in
+    one shot, a lost beam; of particles of several energies too."""
+    settings = [{}, {"v5": {"kick": 1e-4}}, {}, {"v5": {"kick": 0.02}}]
+    model = Model(with_cavities, settings, turns, dimension=dimension)
+    launches = np.zeros((4, 5))
+    launches[:, :4] = 1e-4 * np.random.default_rng(1).standard_normal((4, 4))
+    kicks = {3: np.array([[0.0, 0.0], [1e-4, 0.0], [0.0, 0.0], [0.0, 0.0]])}
+    for given in ({}, kicks):
+        tracked = model.beam(launches, causes, given)
+        along = model.paths(launches, causes, given).beam
+        np.testing.assert_allclose(along, tracked, rtol=0, atol=1e-15)  # of 1e-3 m
+        assert np.isfinite(tracked[:3]).all()
+        assert np.isnan(tracked[3]).any()

@@ -1,11 +1,12 @@
 """Imports run one way: the order of CONTRIBUTING.md, and modules that everybody may use."""
 
 import ast
-import subprocess
-import sys
+import functools
+import graphlib
 from pathlib import Path
 
 import pytest
+from command import printed
 
 PACKAGE = Path(__file__).parent.parent / "tmlattice"
 ORDER = (
@@ -15,21 +16,10 @@ ORDER = (
     "challenge", "systems", "plots", "report", "cli",
 )  # fmt: skip
 BESIDE = {
-    "arrays",
-    "errors",
-    "files",
-    "input_files",
-    "temporaries",
-    "cache",
-    "compiled",
-    "by_name",
-    "late",
-    "speaks",
-    "workers",
-    "batch",
-    "schemas",
-    "version",
-}  # everybody may use them
+    "arrays", "errors", "files", "input_files", "temporaries", "cache", "compiled", "by_name",
+    "late", "speaks", "workers", "batch", "schemas", "version",
+}  # fmt: skip
+"""Everybody may use them."""
 
 FILES = sorted(
     path for path in PACKAGE.rglob("*.py") if "lattices" not in path.relative_to(PACKAGE).parts
@@ -41,8 +31,10 @@ def room(parts):
     return ORDER.index(parts[0]) if parts and parts[0] in ORDER else None
 
 
+@functools.cache
 def imported(path):
     """Modules of the package that a file imports, as parts after `tmlattice`; (parts, line)."""
+    found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names = []
         if isinstance(node, ast.Import):
@@ -52,7 +44,8 @@ def imported(path):
         for name in names:
             first, *rest = name.split(".")
             if first == "tmlattice":
-                yield tuple(rest), node.lineno
+                found.append((tuple(rest), node.lineno))
+    return found
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
@@ -83,22 +76,7 @@ def test_no_circle_of_files():
             if target and target != parts:
                 found.add(target)
         graph[parts] = found
-    done, way = set(), []
-
-    def visit(node):
-        if node in way:
-            circle = [".".join(step) for step in (*way[way.index(node) :], node)]
-            raise AssertionError(" -> ".join(circle))
-        if node in done:
-            return
-        way.append(node)
-        for target in sorted(graph.get(node, ())):
-            visit(target)
-        way.pop()
-        done.add(node)
-
-    for node in sorted(graph):
-        visit(node)
+    graphlib.TopologicalSorter(graph).prepare()  # its error names the circle
 
 
 def test_every_room_is_in_the_order():
@@ -112,5 +90,4 @@ def test_the_diagnosis_needs_neither_torch_nor_ocelot():
         "import tmlattice.diagnosis.response.procedure\n"
         "print(*sorted({'torch', 'ocelot', 'at', 'matplotlib'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not done.stdout.strip()
+    assert not printed("-c", code, cwd=".").strip()

@@ -21,6 +21,13 @@ NAMED = {
     "thin_bend_k1": "products of curvature and gradient",
 }
 """What is left out of a deck, with a warning."""
+COUNTS = {
+    **dict.fromkeys(("bend_k0_edges", "bend_feed_down", "magnet_bend", "rbend_angle_diff"),
+                    ("bend", 16)),
+    "base_thick_slices": ("bend", 48), "magnet": ("quadrupole", 16),
+    "uniform_solenoid": ("solenoid", 8), "cavity_off": ("cavity", 8),
+}  # fmt: skip
+"""How many elements of a kind there are: a class is more than its linear map."""
 
 
 def line_of(deck):
@@ -44,34 +51,30 @@ def excursions(ring):
     return np.abs(np.asarray(path))[:, [0, 2]].max(0)
 
 
-@pytest.mark.parametrize("model", ["adaptive", "full", "rot-kick-rot", "bend-kick-bend"])
-def test_few_kicks_of_a_bend_are_named(tmp_path, model):
-    deck = {"elements": {"bb": {**REFEREE["elements"]["bb"], "model": model, "k1": 0.1,
-                                "integrator": "uniform", "num_multipole_kicks": 1}}}  # fmt: skip
-    with pytest.warns(UserWarning, match=r"the finite number of kicks of bb \(1\)"):
-        load(line_of(deck), tmp_path)
+BEND = REFEREE["elements"]["bb"]
+FEW = {"k1": 0.1, "integrator": "uniform", "num_multipole_kicks": 1}
+MAGNET = {"__class__": "Magnet", "length": 0.4, "k1": 1.1}
+MANY = {"num_multipole_kicks": 21, "integrator": "yoshida-6"}
+KICKS = [
+    *(("bb", {**BEND, **FEW, "model": model}, True)
+      for model in ("adaptive", "full", "rot-kick-rot", "bend-kick-bend")),
+    # as many kicks as the angle asks for, 7 for each 0.022 rad
+    ("bb", {**BEND, "k1": 0.4}, False),
+    ("bb", {**BEND, "k1": 0.4, "angle": 0.01}, True),
+    ("qf", {**MAGNET, "integrator": "adaptive"}, True),
+    ("qf", {**MAGNET, "integrator": "yoshida-4"}, True),
+    ("qf", {**MAGNET, **MANY}, False),
+]  # fmt: skip
 
 
-def test_kicks_of_a_strong_gradient_in_a_weak_bend_are_named(tmp_path):
-    """Xsuite has as many kicks as the angle asks for, 7 for each 0.022 rad."""
-    deck = {"elements": {"bb": {**REFEREE["elements"]["bb"], "k1": 0.4}}}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load(line_of(deck), tmp_path)
-    deck["elements"]["bb"]["angle"] = 0.01
-    with pytest.warns(UserWarning, match=r"the finite number of kicks of bb \(1\)"):
-        load(line_of(deck), tmp_path)
-
-
-@pytest.mark.parametrize("rule", ["adaptive", "yoshida-4"])
-def test_few_kicks_of_a_magnet_are_named(tmp_path, rule):
-    magnet = {"__class__": "Magnet", "length": 0.4, "k1": 1.1, "integrator": rule}
-    with pytest.warns(UserWarning, match=r"the finite number of kicks of qf \(1\)"):
-        load(line_of({"elements": {"qf": magnet}}), tmp_path)
-    magnet |= {"num_multipole_kicks": 21, "integrator": "yoshida-6"}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load(line_of({"elements": {"qf": magnet}}), tmp_path)
+@pytest.mark.parametrize(("name", "element", "few"), KICKS)
+def test_few_kicks_of_a_magnet_are_named(tmp_path, name, element, few):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(line_of({"elements": {name: element}}), tmp_path)
+    messages = [str(w.message) for w in caught]
+    assert len(messages) == few
+    assert all(f"the finite number of kicks of {name} (1)" in message for message in messages)
 
 
 @pytest.mark.parametrize("name", DECKS)
@@ -85,22 +88,15 @@ def test_class_has_xtracks_figures(tmp_path, name):
     assert all(NAMED[name] in message for message in messages)
     assert ring.length == pytest.approx(deck["length"], abs=1e-9)
     assert ring.energy == pytest.approx(3.0)
+    if name in COUNTS:
+        kind, count = COUNTS[name]
+        assert ring.counts()[kind] == count
     tunes = twiss(Chain.from_ring(ring)).total_tunes
     np.testing.assert_allclose(tunes, deck["tunes"], rtol=0, atol=3e-4)
     # maps of second order, and xtrack's own closed orbit to some 1e-9 m
     np.testing.assert_allclose(excursions(ring), deck["orbit"], rtol=0.02, atol=2e-6)
     compaction = off_momentum(Chain.from_ring(ring, 6), ring.length).momentum_compaction
     assert compaction == pytest.approx(deck["momentum_compaction"], rel=5e-4)
-
-
-def test_bends_remain_bends(tmp_path):
-    counts = {name: load(line_of(DECKS[name]), tmp_path).counts() for name in DECKS}
-    for name in ("bend_k0_edges", "bend_feed_down", "magnet_bend", "rbend_angle_diff"):
-        assert counts[name]["bend"] == 16, name
-    assert counts["base_thick_slices"]["bend"] == 48
-    assert counts["magnet"]["quadrupole"] == 16
-    assert counts["uniform_solenoid"]["solenoid"] == 8
-    assert counts["cavity_off"]["cavity"] == 8
 
 
 def test_rf_of_a_harmonic_number(tmp_path):
@@ -186,6 +182,8 @@ def test_forms_of_a_file(tmp_path):
     with pytest.raises(LatticeError, match="no reference particle; give energy="):
         load(environment, tmp_path)
     same(load(environment, tmp_path, energy=3.0))
+    with pytest.raises(LatticeError, match="has the sequences one, two; name one"):
+        load({**environment, "lines": {"one": line, "two": line}}, tmp_path, energy=3.0)
     own = {"lines": {"one": {**line, "elements": elements, "particle_ref": particle}}}
     same(load(own, tmp_path))  # of several lines that share nothing
 

@@ -11,7 +11,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,22 @@ from tmlattice.temporaries import (
     temporary_folder,
 )
 
+OF_PATHS = OSError, RuntimeError, ValueError
+"""Errors of the system, and of a path with links in a circle, or with a NUL byte."""
+
 
 class OutputError(TmlatticeError):
     """A file or folder that cannot be written."""
 
 
-def _refusal(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"cannot write to '{path}': {error.strerror or error}; choose another place")
+@contextmanager
+def _refused(path: Path, *errors: type[Exception]) -> Iterator[None]:
+    """Turn these errors into an OutputError."""
+    try:
+        yield
+    except errors as error:
+        why = getattr(error, "strerror", None) or error
+        raise OutputError(f"cannot write to '{path}': {why}; choose another place") from error
 
 
 @contextmanager
@@ -46,23 +55,18 @@ def output_folder(folder: Path, replaced: Collection[str] = ()) -> Iterator[Path
     Raises:
         OutputError: the folder cannot be made or written.
     """
-    try:
-        folder = folder.resolve()
-        if folder.exists() and not folder.is_dir():
-            raise OutputError(f"'{folder}' is a file; name a folder")
-        place = next(p for p in (folder, *folder.parents) if p.exists())
-        made = temporary_folder(place)
-        temporary = made.__enter__()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise _refusal(folder, _as_os_error(error)) from error
-    try:
-        yield temporary
-        with ThreadPoolExecutor(1) as other:  # Ctrl-C comes before the move or after it
-            other.submit(_put, temporary, folder, replaced).result()
-    except OSError as error:
-        raise _refusal(folder, error) from error
-    finally:
-        made.__exit__(None, None, None)
+    with ExitStack() as made:
+        with _refused(folder, *OF_PATHS):
+            folder = folder.resolve()
+        with _refused(folder, *OF_PATHS):
+            if folder.exists() and not folder.is_dir():
+                raise OutputError(f"'{folder}' is a file; name a folder")
+            place = next(p for p in (folder, *folder.parents) if p.exists())
+            temporary = made.enter_context(temporary_folder(place))
+        with _refused(folder, OSError):
+            yield temporary
+            with ThreadPoolExecutor(1) as other:  # Ctrl-C comes before the move or after it
+                other.submit(_put, temporary, folder, replaced).result()
 
 
 def _put(temporary: Path, folder: Path, replaced: Collection[str]) -> None:
@@ -102,26 +106,21 @@ def output_file(path: Path) -> Iterator[Path]:
     Raises:
         OutputError: the folder is missing or cannot be written, or no process reads the pipe.
     """
-    try:
-        special = path.exists() and not path.is_file() and not path.is_dir()
-        path = path.absolute() if special else path.resolve()
-        if path.is_dir():
-            raise OutputError(f"'{path}' is a folder; name a file")
-        # no file may be made next to a device: the system's folder for temporary files then
-        made = temporary_file(None if special else path.parent)
-        temporary = made.__enter__()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise _refusal(path, _as_os_error(error)) from error
-    try:
-        yield temporary
-        if special:
-            _pour(temporary, path)
-        else:
-            os.replace(temporary, path)
-    except OSError as error:
-        raise _refusal(path, error) from error
-    finally:
-        made.__exit__(None, None, None)
+    with ExitStack() as made:
+        with _refused(path, *OF_PATHS):
+            special = path.exists() and not path.is_file() and not path.is_dir()
+            path = path.absolute() if special else path.resolve()
+        with _refused(path, *OF_PATHS):
+            if path.is_dir():
+                raise OutputError(f"'{path}' is a folder; name a file")
+            # no file may be made next to a device: the system's folder for temporary files then
+            temporary = made.enter_context(temporary_file(None if special else path.parent))
+        with _refused(path, OSError):
+            yield temporary
+            if special:
+                _pour(temporary, path)
+            else:
+                os.replace(temporary, path)
 
 
 def _pour(made: Path, device: Path) -> None:
@@ -144,19 +143,12 @@ def _pour(made: Path, device: Path) -> None:
 def check_writable(path: Path) -> None:
     """Know before the work whether a file can be written there; nothing is left behind;
     OutputError: the folder is not there or cannot be written."""
-    try:
+    with _refused(path, *OF_PATHS):
         if path.is_dir():
             raise OutputError(f"'{path}' is a folder; name a file")
         if not path.exists() or path.is_file():
             with temporary_file(path.resolve().parent):
                 pass
-    except (OSError, RuntimeError, ValueError) as error:
-        raise _refusal(path, _as_os_error(error)) from error
-
-
-def _as_os_error(error: Exception) -> OSError:
-    """A path may hold a NUL byte (ValueError) or links in a circle (RuntimeError) as well."""
-    return error if isinstance(error, OSError) else OSError(errno.EINVAL, str(error))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -216,7 +216,8 @@ def ring_tunes(ring: Ring, energy: float = 0.0) -> list[float] | None:
         energy: relative deviation of the beam's.
     """
     try:
-        turn = ResponseModel(ring).at_energy(energy).tangents[-1] if energy else ring_matrix(ring)
+        model = ResponseModel(ring).at_energy(energy) if energy else None
+        turn = ring_matrix(ring) if model is None else model.tangents[-1]
         return [float(q) for q in matrix_tunes(turn[:4, :4])]
     except (UnstableRingError, np.linalg.LinAlgError):
         return None
@@ -356,7 +357,7 @@ def twiss(ring: Ring | LayerChain | Any) -> Twiss:
 def _through(ring: Ring, start: Array) -> tuple[Array, Array]:
     """States [element + 1, 6] at the start and at the exits of all elements, and the matrices from
     the start to there [element + 1, 6, 6]."""
-    layers = LayerMaps(ring, 6)
+    layers = LayerMaps.of(ring, 6)
     path, total = [start], [np.eye(6)]
     for element in ring.elements:
         image, slopes = layers.map(element)(path[-1])

@@ -8,6 +8,7 @@ from html import unescape
 
 import numpy as np
 import pytest
+from shared import first_turns as turns
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.diagnosis.assessment import STATEMENTS, Assessment, Block, compared_of
@@ -21,12 +22,6 @@ from tmlattice.report.tables import optics_rows
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
 USUAL = background_rms({"all": None})
-
-
-def turns(ring, causes=(), **options):
-    options = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6,
-               **options}  # fmt: skip
-    return simulate(ring, list(causes), **options).measurement()
 
 
 def response(ring, causes=(), **options):

@@ -8,8 +8,6 @@ alive. A verdict's exit code is 0 or 1.
 """
 
 import contextlib
-import io
-import json
 import os
 import re
 import resource
@@ -18,11 +16,10 @@ import subprocess
 import sys
 import tempfile
 import traceback
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from unittest import mock
 
+from command import tmlattice
 from damage import (
     damaged_bytes,
     damaged_hdf5,
@@ -33,6 +30,8 @@ from damage import (
     damaged_toml,
     damaged_yaml,
 )
+
+from tmlattice.temporaries import PREFIX
 
 SECONDS = 5.0
 HANG = 300
@@ -86,10 +85,7 @@ def worked():
 
 
 def called(words, folder):
-    """Exit code, output and seconds of a command, in this process."""
-    from tmlattice.cli.command import main
-
-    out, errors = io.StringIO(), io.StringIO()
+    """Exit code, output and processor seconds of a command, in this process; ended after `HANG`."""
     begun = worked()
 
     def late(*_):
@@ -98,28 +94,15 @@ def called(words, folder):
     old = signal.signal(signal.SIGALRM, late)
     signal.alarm(HANG)
     try:
-        with (
-            contextlib.chdir(folder),
-            mock.patch.object(sys, "argv", ["tmlattice", *words]),
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(errors),
-            warnings.catch_warnings(),
-        ):
-            warnings.resetwarnings()
-            for library in (DeprecationWarning, PendingDeprecationWarning, ImportWarning):
-                warnings.simplefilter("ignore", library)
-            try:
-                main()
-            except SystemExit as end:
-                code = end.code
+        done = tmlattice(*words, cwd=folder)
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, old)
-    return code, out.getvalue(), errors.getvalue(), worked() - begun
+    return done.returncode, done.stdout, done.stderr, worked() - begun
 
 
-def broken(words, folder, tally):
-    """What of the contract a command breaks, or None."""
+def broken(words, folder, tally, whole=False):
+    """What of the contract a command breaks, or None; of whole files it writes its outputs."""
     before = set(folder.rglob("*"))
     try:
         with past_python() as seen:
@@ -133,7 +116,9 @@ def broken(words, folder, tally):
         return traceback.format_exc(limit=-4)
     tally.longest = max(tally.longest, seconds)
     tally.slow += seconds > SECONDS
-    if left := {p.name for p in folder.rglob("*")} - {p.name for p in before}:
+    left = {p.name for p in folder.rglob("*")} - {p.name for p in before}
+    left = {name for name in left if name.startswith(PREFIX) or not whole}
+    if left:
         return f"left behind: {left}"
     if code not in (0, 1, 2, None):
         return f"exit code {code}"
@@ -158,7 +143,7 @@ def damages(path, whole):
     return damaged_bytes, other, values, values
 
 
-def tried(seed, folder, inputs, rng):
+def tried(seed, inputs, rng):
     """One damaged input: (format, what of the contract it breaks or None)."""
     name = inputs.names[seed % len(inputs.names)]
     words, path = inputs.of(name)
@@ -175,23 +160,13 @@ def tried(seed, folder, inputs, rng):
             tally.undamaged += 1
             return name, None
         path.write_bytes(content)
-        said = broken(words, folder, tally)
+        said = broken(words, inputs.folder, tally)
         if said is not None:
             tally.broken.append(f"seed {seed}: {said}")
         return name, said
     finally:
         path.write_bytes(whole)
         inputs.put_back()
-
-
-def tried_whole(name, folder, inputs):
-    """An input that is not damaged is accepted."""
-    words, _ = inputs.of(name)
-    tally = Tally()
-    said = broken(words, folder, tally)
-    inputs.put_back()
-    assert said is None, f"{name}: {said}"
-    assert tally.accepted == 1, name
 
 
 def limit_memory():
@@ -226,45 +201,36 @@ def forked(command, **options):
         return subprocess.CompletedProcess(command, code, answer.read(), b"")
 
 
-@dataclass
 class Inputs:
-    """Files of every format in a folder, and the command that reads each."""
+    """Files of every format in a folder, on a ring of ten magnets, and the command of each."""
 
-    folder: Path
-    commands: dict[str, tuple[list[str], str]]
-    tallies: dict[str, Tally] = field(default_factory=dict)
-    kept: dict[Path, bytes] = field(default_factory=dict)
+    def __init__(self, folder, challenges=True):
+        from inputs import write_all
+
+        self.folder = folder
+        self.commands = write_all(folder, challenges)
+        self.names = list(self.commands)
+        self.tallies = {}
+        self.results = {p: p.read_bytes() for p in folder.glob("set/results/*")}
+
+    def check_accepted(self):
+        """Each command accepts its files, which are not damaged, and writes its outputs."""
+        for words in {str(words): words for words, _ in self.commands.values()}.values():
+            tally = Tally()
+            said = broken(words, self.folder, tally, whole=True)
+            self.put_back()
+            assert said is None, f"{words}: {said}"
+            assert tally.accepted == 1, words
 
     def put_back(self):
         """Results that a damaged case has changed: as they were."""
         for path, content in self.results.items():
             path.write_bytes(content)
 
-    @property
-    def results(self):
-        """What a command writes because it is asked to."""
-        if not self.kept:
-            self.kept.update({p: p.read_bytes() for p in self.folder.glob("set/results/*")})
-        return self.kept
-
-    @property
-    def names(self):
-        """Of the formats."""
-        return list(self.commands)
-
     def of(self, name):
         """The command that reads a format, and its file."""
         words, file = self.commands[name]
         return words, self.folder / file
-
-
-def made(folder, challenges=True):
-    """Every format, on a ring of ten magnets."""
-    from inputs import write_all
-
-    inputs = Inputs(folder, write_all(folder, challenges))
-    inputs.put_back()
-    return inputs
 
 
 def report(inputs):
@@ -279,8 +245,3 @@ def report(inputs):
             f"   longest {t.longest:.1f} s"
         )
     return "\n".join(rows)
-
-
-def dumped(inputs, path):
-    """The same as JSON."""
-    path.write_text(json.dumps({n: vars(t) for n, t in inputs.tallies.items()}, indent=1))

@@ -122,10 +122,12 @@ def prepared(folder, challenges=True):
         results.unlink()
 
 
-def fresh(master, folder):
-    """A folder with those files and nothing else."""
+def fresh(name, master, folder, results):
+    """A folder with what a command reads, and nothing else; the score reads results of a run."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(master, folder)
+    if name == "challenge score":
+        shutil.copytree(results, folder / "set" / "results", dirs_exist_ok=True)
 
 
 def references(master, folder, names=tuple(COMMANDS)):
@@ -134,10 +136,7 @@ def references(master, folder, names=tuple(COMMANDS)):
     results = None
     for name in names:
         words, outputs = COMMANDS[name]
-        fresh(master, folder)
-        if name == "challenge score":  # it reads what the run wrote
-            shutil.copytree(results, master / "set" / "results", dirs_exist_ok=True)
-            fresh(master, folder)
+        fresh(name, master, folder, results)
         begun = time.perf_counter()
         _, status = os.waitpid(child(words, folder), 0)
         seconds = time.perf_counter() - begun
@@ -145,7 +144,6 @@ def references(master, folder, names=tuple(COMMANDS)):
         whole[name] = contents(folder, outputs), seconds
         if name == "challenge run":
             results = Path(shutil.copytree(folder / "set/results", master.parent / "results"))
-    shutil.rmtree(master / "set" / "results", ignore_errors=True)
     return whole, results
 
 
@@ -153,9 +151,7 @@ def killed(name, whole, results, master, folder, rng):
     """One kill: what of the promise is broken, or None; and whether it hit the command alive."""
     words, outputs = COMMANDS[name]
     expected, seconds = whole[name]
-    fresh(master, folder)
-    if name == "challenge score":
-        shutil.copytree(results, folder / "set" / "results", dirs_exist_ok=True)
+    fresh(name, master, folder, results)
     if rng.integers(2):  # over an older output
         os.waitpid(child(words, folder), 0)
     process = child(words, folder)
@@ -181,9 +177,7 @@ def killed(name, whole, results, master, folder, rng):
 def filled(name, results, master, folder, limit):
     """A disk that is full after so many bytes of a file: what is broken, or None."""
     words, outputs = COMMANDS[name]
-    fresh(master, folder)
-    if name == "challenge score":
-        shutil.copytree(results, folder / "set" / "results", dirs_exist_ok=True)
+    fresh(name, master, folder, results)
     before = contents(folder, outputs)
     _, status = os.waitpid(child(words, folder, limit), 0)
     code = os.waitstatus_to_exitcode(status)

@@ -65,7 +65,7 @@ def write_network(ten, folder):
 
 
 def write_sdds(path, monitors, readings):
-    """Arrays of one page, after the format's definition."""
+    """Arrays of one page, one a monitor and plane, in mm, after the format's definition."""
     lines = ["SDDS1", "!# little-endian"]
     names = [f"{m}:{p}" for m in monitors for p in "XY"]
     lines += [f"&array name={n}, type=double, units=mm, dimensions=1, &end" for n in names]
@@ -84,8 +84,6 @@ def write_control_room(folder):
     turns = read_measurement(folder / "turns")
     write_sdds(folder / "room/readings.sdds", turns.monitors, turns.readings[:, 0])
     wide = ["diagnose", "room/readings_wide.csv", "--machine", "room/tmlattice.toml"]
-    tmlattice("import", "room/response.csv", "--lattice", "ring.json", "--out", "bring", "-q",
-              cwd=folder, check=0)  # fmt: skip
     check = lambda name: (["check", "ring.json", name], name)  # noqa: E731
     return {
         "table, a row a shot": (wide, "room/readings_wide.csv"),
@@ -103,24 +101,14 @@ def write_control_room(folder):
 def write_loco(folder):
     """A LOCO file, whose variables the tests of the importer make, with a fit of two iterations."""
     import scipy.io
-    from test_import import simulated
+    from test_import import simulated, with_fit
 
-    variables = simulated.__wrapped__()
-    lattice = variables["RINGData"]["Lattice"]
-    at = next(i for i, fields in enumerate(lattice) if fields["FamName"] == "QF")
-    moved = {"ElemIndex": at + 1.0, "FieldName": "PolynomB", "FieldIndex": np.array([1, 2.0])}
-    last = float(lattice[at]["PolynomB"][1])
-    fits = [{"Params": np.array([moved], dtype=object), "Values": np.array([value])}
-            for value in (0.9 * last, last)]  # fmt: skip
-    variables["FitParameters"] = np.array(fits, dtype=object)
+    variables = with_fit(simulated.__wrapped__(), (0.9, 1.0))
     variables["LocoModel"] = {"Eta": 1.1 * variables["LocoMeasData"]["Eta"]}
     scipy.io.savemat(folder / "loco.mat", variables)
-    words = ["import", "loco.mat", "--out", "loco"]
-    tmlattice(*words, "-q", cwd=folder, check=0)
-    first = [*words, "--force", "--iteration", "last"]
-    return {
-        "LOCO .mat": ([*words, "--force"], "loco.mat"), "LOCO .mat, first": (first, "loco.mat")
-    }  # fmt: skip
+    words = ["import", "loco.mat", "--out", "loco", "--force"]
+    last = [*words, "--iteration", "last"]
+    return {"LOCO .mat": (words, "loco.mat"), "LOCO .mat, first": (last, "loco.mat")}
 
 
 def write_matlab_and_hdf5(folder):
@@ -139,8 +127,6 @@ def write_matlab_and_hdf5(folder):
     test_import.esrf.__wrapped__(simulated, factory)
     parts = ["orm.h5", "eta.h5", "noise.h5", "names.json", "ring.mat"]
     esrf = ["import", *(f"esrf/{part}" for part in parts), "--out", "brought", "--force"]
-    for words in (seven, layer, esrf):
-        tmlattice(*words, "-q", cwd=folder, check=0)
     return {"LOCO .mat 7.3": (seven, "seven.mat"),
             "Middle Layer, response": (layer, "b.mat"), "Middle Layer, others": (layer, "c.mat"),
             **{f"ESRF {part}": (esrf, f"esrf/{part}") for part in parts}}  # fmt: skip
@@ -155,7 +141,6 @@ def write_turns_of_others(folder):
         name = f"turns.{kind}"
         getattr(test_input_files, kind)(folder / name)
         words = ["import", name, "--turns", kind, "--unit", "m", "--out", f"of_{kind}", "--force"]
-        tmlattice(*words, "-q", cwd=folder, check=0)
         found[f"turns of {kind}"] = words, name
     return found
 
@@ -168,7 +153,6 @@ def write_together(folder):
     (folder / "settings.json").write_text('[{"qf::0": {"k1_relative": 0.01}}, {}]')
     simulate = ["simulate", "ring.json", "--shots", "2", "--settings", "settings.json", "--engine",
                 "ocelot", "--out", "simulated", "--force", "-q"]  # fmt: skip
-    tmlattice(*simulate, cwd=folder, check=0)
     return {
         "joint, JSON": (joint, "dispersion/measurement.json"),
         "joint, table": (joint, "tunes/tunes.csv"),
@@ -188,7 +172,6 @@ def write_calibration(folder):
     own = calibration.Calibration(causes)
     calibration.write_calibration(folder / "calibration.json", own)
     words = ["predict", "ring.json", "--calibration", "calibration.json", "--out", "told.csv"]
-    tmlattice(*words, "-q", cwd=folder, check=0)
     return {"calibration": (words, "calibration.json")}
 
 
@@ -216,8 +199,6 @@ def write_results(folder):
     )
     init = ["init", "ring.json", "room/readings.h5", "--machine", "new.toml", "--force", "-q"]
     shutil.copytree(folder / "response", folder / "other")
-    for words in (settle, report, init):
-        tmlattice(*words, cwd=folder, check=0)
     return {
         "report": (report, "of response/diagnosis.json"),
         "report, lattice": (report, "of response/diagnosis.lattice.json"),

@@ -3,6 +3,7 @@
 python tests/fuzz/run.py [INPUTS] [FIRST SEED] [SECONDS AT MOST] [FILE.json]
 """
 
+import json
 import os
 import resource
 import sys
@@ -15,7 +16,7 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
-from contract import dumped, forked, limit_memory, made, report, tried, tried_whole  # noqa: E402
+from contract import Inputs, forked, limit_memory, report, tried  # noqa: E402
 
 
 def main(count=10_000, first=0, seconds=10**9, file=None):
@@ -23,10 +24,8 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
     with tempfile.TemporaryDirectory() as place:
         os.environ["TMLATTICE_CACHE"] = "off"
         os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-        folder = Path(place)
-        inputs = made(folder)
-        for name in inputs.names:  # whatever they import is the package's own memory
-            tried_whole(name, folder, inputs)
+        inputs = Inputs(Path(place))
+        inputs.check_accepted()  # whatever the commands import is the package's own memory
         limit_memory()
         end = time.monotonic() + seconds
         begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -34,7 +33,7 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
             if time.monotonic() > end:
                 break
             with mock.patch("tmlattice.lattice.mat_file.subprocess.run", forked):
-                name, said = tried(seed, folder, inputs, np.random.default_rng([19, seed]))
+                name, said = tried(seed, inputs, np.random.default_rng([19, seed]))
             if seed % 500 == 499:
                 print(f"{seed + 1 - first} inputs", flush=True)
             if said is not None:
@@ -43,7 +42,8 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         print(f"memory: {begun >> 10} MB with every format read once, {most >> 10} MB at the end")
         if file:
-            dumped(inputs, Path(file))
+            tallies = {name: vars(tally) for name, tally in inputs.tallies.items()}
+            Path(file).write_text(json.dumps(tallies, indent=1))
         return any(tally.broken for tally in inputs.tallies.values())
 
 

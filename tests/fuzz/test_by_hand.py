@@ -17,7 +17,6 @@ from at_ring import at_lattice
 from command import tmlattice
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contract import called
 from inputs import ring, write_all
 
 from tmlattice import batch, diagnose, load_ring, read_measurement
@@ -26,9 +25,6 @@ from tmlattice.diagnosis.families.steps import MonitorGain
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.importers import Options, bring_in
 from tmlattice.observe.response_data import response_data, split_columns
-
-TURNS = ("diagnose", "ring.json", "turns")
-RESPONSE = ("diagnose", "ring.json", "response")
 
 
 @pytest.fixture(scope="module")
@@ -75,48 +71,87 @@ def scaled(factor):
     return change
 
 
-DOCUMENTS = {
-    "a key in other letters": (lambda d: d.update(NOISE=d.pop("noise")), "NOISE"),
-    "an energy in eV": (lambda d: d.update(energy_gev=3e9), "eV"),
-    "a launch outside every pipe": (lambda d: d["shots"][0]["launch"].update(x=0.1), "lost"),
+def document(change):
+    return lambda folder: edited(folder / "turns/measurement.json", change)
+
+
+def turns(change):
+    return lambda folder: rows_of(folder / "turns/readings.csv", change)
+
+
+def response(change):
+    return lambda folder: rows_of(folder / "response/response.csv", change)
+
+
+def text(file, content):
+    return lambda folder: (folder / file).write_text(content)
+
+
+def pipe(folder):
+    (folder / "turns/readings.csv").unlink()
+    os.mkfifo(folder / "turns/readings.csv")
+
+
+TURNS = ("diagnose", "ring.json", "turns")
+RESPONSE = ("diagnose", "ring.json", "response")
+CHECK = ("check", "ring.json", "a.csv")
+CORRECT = ("correct", "ring.json", "--design", "ring.json", "--knobs", "k.csv")
+WIDE = (
+    "shot,m::0 x [mm],m::1 x [mm],m::2 x [mm],m::0 y [mm]\n0,0.1,{},0.3,0.1\n1,0.2,0.1,-0.1,0.2\n"
+)
+LONG = "9" * 200_000
+WRONG = {  # a command, what was changed in a folder of every kind, and a word of the sentence
+    "a key in other letters": (
+        TURNS, document(lambda d: d.update(NOISE=d.pop("noise"))), "NOISE"),
+    "an energy in eV": (TURNS, document(lambda d: d.update(energy_gev=3e9)), "eV"),
+    "a launch outside every pipe": (
+        TURNS, document(lambda d: d["shots"][0]["launch"].update(x=0.1)), "lost"),
     "a kick of a radian": (
-        lambda d: [shot.update(settings={"ch::0": {"kick": 1.0}}) for shot in d["shots"]],
-        "settings"),
-    "a number of 400 digits": (lambda d: d.update(energy_gev=10**400), "digits"),
+        TURNS, document(lambda d: [shot.update(settings={"ch::0": {"kick": 1.0}})
+                                   for shot in d["shots"]]), "settings"),
+    "a number of 400 digits": (TURNS, document(lambda d: d.update(energy_gev=10**400)), "digits"),
     "a list in a list in a list": (
-        lambda d: d.update(noise=json.loads("[" * 400 + "]" * 400)), "noise"),
+        TURNS, document(lambda d: d.update(noise=json.loads("[" * 400 + "]" * 400))), "noise"),
     "shots by the thousand without a reading": (
-        lambda d: d.update(shots=d["shots"] * 4_000), "shots"),
-}  # fmt: skip
-TABLES = {
-    "one row of turn 100": (lambda rows: rows[0].update(turn="100"), "turn"),
-    "all turns counted from 1": (every(turn="1"), "turn"),
-    "an element that is no monitor": (lambda rows: rows[0].update(monitor="qf::0"), "qf::0"),
-    "readings that never change": (every(x="1e-4", y="1e-4"), "the same"),
-    "readings that are all zero": (every(x="0", y="0"), "zero"),
+        TURNS, document(lambda d: d.update(shots=d["shots"] * 4_000)), "shots"),
+    "one row of turn 100": (TURNS, turns(lambda rows: rows[0].update(turn="100")), "turn"),
+    "all turns counted from 1": (TURNS, turns(every(turn="1")), "turn"),
+    "an element that is no monitor": (
+        TURNS, turns(lambda rows: rows[0].update(monitor="qf::0")), "qf::0"),
+    "readings that never change": (TURNS, turns(every(x="1e-4", y="1e-4")), "the same"),
+    "readings that are all zero": (TURNS, turns(every(x="0", y="0")), "zero"),
+    "a response without readings": (RESPONSE, response(every(x="", y="")), ""),
+    "a response of zeros": (RESPONSE, response(every(x="0", y="0")), ""),
+    "one column of a response": (RESPONSE, response(lambda rows: rows[:6]), ""),
+    "a pipe in place of a table": (TURNS, pipe, "readings.csv"),
+    "readings far above the pipe's radius": (
+        CHECK, text("a.csv", WIDE.format("1").replace("0.", "900.")),
+        "most readings are above 0.2 m"),
+    "a field that CSV does not take": (
+        CHECK, text("a.csv", WIDE.format(LONG)), "not CSV (field larger"),
+    "a setting that CSV does not take": (
+        CORRECT, text("k.csv", f"knob,present\nqf,{LONG}"), "field larger than field limit"),
+    "a path of supplies that no file has": (
+        CORRECT[:2],
+        text("tmlattice.toml", 'supplies = "k\\u0000.csv"\n[lattice]\nfile = "ring.json"\n'),
+        "k\\x00.csv'"),
 }  # fmt: skip
 
 
 def told(done):
     """The sentence."""
-    sentences = [s for s in done.stderr.splitlines() if not s.startswith("tmlattice: warning")]
+    before = ("tmlattice: warning", "tmlattice: machine file")
+    sentences = [s for s in done.stderr.splitlines() if not s.startswith(before)]
     assert done.returncode == 2, done.stdout
     assert sentences[0].startswith("tmlattice: ")
     return sentences[0]
 
 
-@pytest.mark.parametrize("what", DOCUMENTS)
-def test_first_turns_whose_description_is_wrong(folder, what):
-    change, word = DOCUMENTS[what]
-    edited(folder / "turns/measurement.json", change)
-    assert word in told(tmlattice(*TURNS, cwd=folder))
-
-
-@pytest.mark.parametrize("what", TABLES)
-def test_first_turns_whose_readings_are_wrong(folder, what):
-    change, word = TABLES[what]
-    rows_of(folder / "turns/readings.csv", change)
-    assert word in told(tmlattice(*TURNS, cwd=folder))
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_one_sentence_that_says_where(folder, what):
+    words, change, word = WRONG[what]
+    change(folder)
+    assert word in told(tmlattice(*words, cwd=folder))
 
 
 def test_readings_a_hundred_times_too_large_are_an_answer(folder):
@@ -124,17 +159,6 @@ def test_readings_a_hundred_times_too_large_are_an_answer(folder):
     rows_of(folder / "turns/readings.csv", scaled(100.0))
     ring, turns = load_ring(folder / "ring.json"), read_measurement(folder / "turns")
     assert diagnose(ring, turns).verdict in ("localised", "distributed")
-
-
-@pytest.mark.parametrize("what", ["empty", "zero", "one column"])
-def test_responses_of_nothing(folder, what):
-    change = {
-        "empty": every(x="", y=""),
-        "zero": every(x="0", y="0"),
-        "one column": lambda rows: rows[:6],
-    }[what]
-    rows_of(folder / "response/response.csv", change)
-    told(tmlattice(*RESPONSE, cwd=folder))
 
 
 @pytest.mark.parametrize("suffix", ["json", "mat", "m", "repr"])
@@ -155,13 +179,6 @@ def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
     found = fit_families(data, split, (straights, (MonitorGain(),)))
     tried = [own.effect for own in found.families]
     assert tried == [MonitorGain().title]
-
-
-def test_a_pipe_in_place_of_a_table_is_not_waited_for(folder):
-    path = folder / "turns/readings.csv"
-    path.unlink()
-    os.mkfifo(path)
-    assert "readings.csv" in told(tmlattice(*TURNS, cwd=folder))
 
 
 @pytest.mark.parametrize("place", ["lattice", "monitor"])
@@ -225,34 +242,11 @@ def test_a_report_shows_no_figure_of_another_diagnosis(kept, tmp_path):
     assert "before any finding" not in page.read_text()
 
 
-WIDE = (
-    "shot,m::0 x [mm],m::1 x [mm],m::2 x [mm],m::0 y [mm]\n0,0.1,{},0.3,0.1\n1,0.2,0.1,-0.1,0.2\n"
-)
-
-
 def test_a_reading_that_no_pipe_has_room_for_is_rejected_by_name(folder):
     for value in ("-1e300", "1e9", "inf"):
         (folder / "a.csv").write_text(WIDE.format(value))
-        done = tmlattice("check", "ring.json", "a.csv", cwd=folder)
+        done = tmlattice(*CHECK, cwd=folder)
         assert "rejected readings, above 0.2 m: 1, of 'm::1'" in done.stdout
-    (folder / "a.csv").write_text(WIDE.format("1").replace("0.", "900."))
-    assert "most readings are above 0.2 m" in told(tmlattice("check", "ring.json", "a.csv",
-                                                             cwd=folder))  # fmt: skip
-
-
-def test_a_field_that_csv_does_not_take_is_a_sentence(folder):
-    (folder / "a.csv").write_text(WIDE.format("9" * 200_000))
-    assert "not CSV (field larger" in told(tmlattice("check", "ring.json", "a.csv", cwd=folder))
-    (folder / "k.csv").write_text("knob,present\nqf," + "9" * 200_000)
-    words = ("correct", "ring.json", "--design", "ring.json", "--knobs", "k.csv")
-    assert "field larger than field limit" in told(tmlattice(*words, cwd=folder))
-
-
-def test_a_path_of_supplies_that_no_file_has_is_a_sentence(folder):
-    (folder / "tmlattice.toml").write_text(
-        'supplies = "k\\u0000.csv"\n[lattice]\nfile = "ring.json"\n'
-    )
-    assert "k\\x00.csv'" in tmlattice("correct", "ring.json", cwd=folder, check=2).stderr
 
 
 @pytest.mark.parametrize("place", ["/dev/zero", "/proc/kmsg"])
@@ -312,6 +306,6 @@ def test_init_reads_a_file_that_is_damaged_once(folder):
     """Only names that the lattice does not have are a reason to read it again."""
     (folder / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(2000))
     with mock.patch("tmlattice.lattice.mat_file.subprocess.run", wraps=subprocess.run) as read:
-        code, _, errors, _ = called(["init", "ring.json", "a.h5"], folder)
-    assert (code, read.call_count) == (2, 1)
-    assert "a.h5' cannot be read as HDF5" in errors
+        said = told(tmlattice("init", "ring.json", "a.h5", cwd=folder))
+    assert read.call_count == 1
+    assert "a.h5' cannot be read as HDF5" in said

@@ -7,18 +7,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice import Cause, simulate
-from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.prepare import prepare
-from tmlattice.effects import apply, background_rms, find, modelled, monitors_with
+from tmlattice.effects import background_rms, find, modelled
 from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
 from tmlattice.inference.search import outlier
-from tmlattice.machine.stored_beam import simulate_turns
-from tmlattice.measurement import ClosedOrbit
+from tmlattice.machine.stored_beam import simulate_orbits, simulate_turns
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.orbits import closed_orbits
@@ -28,24 +26,17 @@ WEAK = Cause("quadrupole_gradient", "QD::3", -0.02)
 NOISE = 1e-6
 
 
-def _orbit(ring, causes, seed):
-    model = ResponseModel(apply(ring, causes))
-    read = monitors_with(ring, causes).read(model.readings)
-    read = read + NOISE * np.random.default_rng(seed).standard_normal(read.shape)
-    names = tuple(monitor.name for monitor in ring.monitors)
-    return ClosedOrbit(orbit=read[None], monitors=names, noise=(NOISE, NOISE))
-
-
 @pytest.fixture(scope="module")
 def turns(small_ring):
     measured = simulate(small_ring, [WEAK], shots=3, seed=3).measurement()
-    return prepare(small_ring, measured, None, False, None, DEFAULT).problem
+    return prepare(small_ring, measured, False, None, DEFAULT).problem
 
 
 @pytest.fixture(scope="module")
 def orbit(small_ring):
     kick = Cause("corrector_kick_x", "v6", 2e-5)
-    return closed_orbits(small_ring, _orbit(small_ring, [WEAK, kick], 1), {})
+    measured = simulate_orbits(small_ring, [WEAK, kick], noise=NOISE, seed=1).measured
+    return closed_orbits(small_ring, measured, {})
 
 
 def test_rows_of_both_are_the_rows_of_each(turns, orbit):
@@ -108,24 +99,38 @@ def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
     assert np.abs(sought[count:] - fixed[count:]).max() > 1
 
 
-def test_fast_products_among_small_errors_are_those_of_all_signatures(turns):
+@pytest.mark.parametrize("since", [False, True], ids=["alone", "since a reference"])
+def test_fast_products_among_small_errors_are_those_of_all_signatures(small_ring, turns, since):
     """Two ways to the same scan: sums over readings, and signatures that are whitened."""
+    measured = turns
+    if since:
+        earlier = simulate(small_ring, [], shots=2, seed=4).measurement()
+        before = prepare(small_ring, earlier, False, None, DEFAULT).problem
+        measured = CombinedProblem.of([turns], [before])
     rms = {name: find(name).background for name in ("quadrupole_gradient", "monitor_gain_x")}
     everywhere = [(name, place) for name in rms for place in find(name).places(turns.model.ring)]
-    start = fit(turns, (), turns.first)
+    start = fit(measured, (), measured.first)
     among = fit_distributed_errors(
-        turns, DistributedErrors.usual(everywhere, rms), start.nuisances, learn=False
+        measured, DistributedErrors.usual(everywhere, rms), start.nuisances, learn=False
     )
     assert among.before.chi2 < 0.9 * start.chi2
     problem = among.problem
     some = [(WEAK.effect, WEAK.element), ("monitor_offset_y", "end_1"), ("energy_spread", None),
             ("quadrupole_offset_x", "QF::3"), ("monitor_swap", "bpm::4")]  # fmt: skip
     data = among.before.residual[None]
-    found = problem.metric(among.before.point).products(some, data)
-    out = among.before.projection.out
-    rows = out(problem.white(turns.metric(among.before.point.view).rows(some)))
+    metric, out = problem.metric(among.before.point), among.before.projection.out
+    found = metric.products(some, data)
+    rows = out(problem.white(problem.inner.metric(among.before.point.view).rows(some)))
     assert_allclose(found.whole - found.inside, np.einsum("hr,hr->h", rows, rows), rtol=1e-6)
     assert_allclose(found.inner, rows @ out(data).T, rtol=1e-6, atol=1e-6)
+    places = [3, 20]
+    gram, inner = metric.free_kicks(np.array(places), out(data[0]))
+    for place, own_gram, own_inner in zip(places, gram, inner, strict=True):
+        rows = out(problem.kick_rows(among.before.point, place))
+        assert len(rows) == 2 * turns.data.shots
+        size = np.sqrt(np.einsum("pr,pr->p", rows, rows))
+        assert_allclose(own_gram[0], rows @ rows.T, atol=1e-6 * size.max() ** 2)
+        assert_allclose(own_inner[0], rows @ data[0], atol=1e-6 * size.max())
 
 
 @pytest.mark.parametrize("shots", [1, 4], ids=["more errors than readings", "fewer"])
@@ -154,14 +159,9 @@ def test_an_outlier_among_small_errors_is_the_reading_without_which_chi_square_f
 def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
     """Sizes learnt from closed orbits; a corrector that is far off stands out among them."""
     usual = background_rms({"all": None})
-    rng = np.random.default_rng(5)
-    small = [
-        Cause(name, place, float(rms * rng.standard_normal()))
-        for name, rms in usual.items()
-        for place in find(name).places(small_ring)
-    ]
-    everywhere = [(cause.effect, cause.element) for cause in small]
-    problem = closed_orbits(small_ring, _orbit(small_ring, small, 2), {})
+    everywhere = [(name, place) for name in usual for place in find(name).places(small_ring)]
+    measured = simulate_orbits(small_ring, noise=NOISE, background=usual, seed=2).measured
+    problem = closed_orbits(small_ring, measured, {})
     learnt = fit_distributed_errors(
         problem, DistributedErrors.usual(everywhere, usual), problem.first
     )

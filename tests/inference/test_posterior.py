@@ -91,7 +91,7 @@ def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeyp
 def test_nuisances_are_projected_out(small_ring, everywhere):
     """First turns have a launch each, which the two ways settle each in its own noise."""
     measured = simulate(small_ring, background=USUAL, machine_seed=5, shots=3, seed=3).measurement()
-    turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
+    turns = prepare(small_ring, measured, False, None, DEFAULT).problem
     usual = DistributedErrors.usual(everywhere, USUAL)
     direct = fit_distributed_errors(turns, usual, turns.first, learn=False)
     sums_at = posterior(turns, usual, learn=False).known
@@ -111,7 +111,7 @@ def test_first_turns_far_from_the_design_are_followed_along_the_way(small_ring):
         strong, background=twice, machine_seed=2, shots=3, turns=4, amplitude=3e-4, seed=3
     ).measurement()
     assert np.sqrt(np.nanmean(measured.readings**2)) > 4e-3
-    turns = prepare(strong, measured, None, False, None, DEFAULT).problem
+    turns = prepare(strong, measured, False, None, DEFAULT).problem
     seen = [(n, p) for n in USUAL for p in find(n).places(strong) if turns.sees((n, p))]
     found = posterior(turns, DistributedErrors.usual(seen, twice), learn=False)
     assert chi2_of(turns, found) < turns.valid.sum()
@@ -125,7 +125,7 @@ def test_amounts_follow_the_estimated_scales(small_ring):
     measured = simulate(
         small_ring, background=machine, machine_seed=2, shots=3, turns=2, seed=3
     ).measurement()
-    turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
+    turns = prepare(small_ring, measured, False, None, DEFAULT).problem
     seen = [(n, p) for n in usual for p in find(n).places(small_ring) if turns.sees((n, p))]
     found = posterior(turns, DistributedErrors.usual(seen, usual))
     assert all(10 < rms / usual[name] < 90 for name, rms in found.sizes.items())

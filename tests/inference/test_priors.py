@@ -174,6 +174,7 @@ def test_a_member_that_the_data_do_not_see_may_be_faulty():
     np.testing.assert_allclose(np.sqrt(held.covariance[0, 0]), SOUND, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_pulls_are_one_over_machines_as_the_prior_has_them(rng):
     """Eight members, one faulty in the mean, of which the data know half the sum of neighbours."""
     group = members(8)

@@ -10,6 +10,7 @@ compaction, orbit at the start, and the beam, and the version of MAD-X. A new de
 test_madx_decks.py reads both.
 """
 
+import contextlib
 import json
 import tempfile
 from pathlib import Path
@@ -17,7 +18,9 @@ from pathlib import Path
 FILE = Path(__file__).with_name("madx_decks.json")
 
 
-def figures(text):
+@contextlib.contextmanager
+def started(text):
+    """MAD-X with the ring of a deck in use, and the folder in which it works."""
     from cpymad.madx import Madx
 
     with tempfile.TemporaryDirectory() as folder:
@@ -26,15 +29,19 @@ def figures(text):
         mad.call("ring.madx")
         if "use," not in text:
             mad.input("use, sequence=ring;")
+        yield mad, Path(folder)
+        mad.exit()
+
+
+def figures(text):
+    with started(text) as (mad, _):
         mad.input("twiss;")
         summ, table = mad.table.summ, mad.table.twiss
         orbit = [float(table[k][0]) for k in ("x", "px", "y", "py")]
         beam = mad.sequence[str(table.summary.sequence).lower()].beam
         own = {k: float(summ[k][0]) for k in ("q1", "q2", "dq1", "dq2", "length", "alfa")}
         own |= {"orbit": orbit, "energy": float(beam.energy), "mass": float(beam.mass)}
-        version = str(mad.version)
-        mad.exit()
-    return own, version
+        return own, str(mad.version)
 
 
 COLUMNS = ("name,keyword,s,l,angle,k0l,k0sl,k1l,k1sl,k2l,k2sl,e1,e2,h1,h2,hgap,fint,fintx,tilt,"
@@ -44,17 +51,9 @@ HEADER = ("MASS", "CHARGE", "ENERGY", "BV_FLAG", "LENGTH", "ALFA", "XCOMAX", "YC
 
 
 def table(text, options=""):
-    from cpymad.madx import Madx
-
-    with tempfile.TemporaryDirectory() as folder:
-        mad = Madx(stdout=False, cwd=folder)
-        Path(folder, "ring.madx").write_text(f"{text};\n")
-        mad.call("ring.madx")
-        if "use," not in text:
-            mad.input("use, sequence=ring;")
+    with started(text) as (mad, folder):
         mad.input(f"select, flag=twiss, column={COLUMNS}; twiss, {options} file=twiss.tfs;")
-        lines = [line.split() for line in Path(folder, "twiss.tfs").read_text().splitlines()]
-        mad.exit()
+        lines = [line.split() for line in (folder / "twiss.tfs").read_text().splitlines()]
     header = [line for line in lines if line[0] == "@" and line[1] in HEADER]
     names, types, *rows = [line for line in lines if line[0] != "@"]
     needed = ("NAME", "KEYWORD", "S", "L", "ANGLE", "K1L", "K2L")

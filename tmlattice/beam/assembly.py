@@ -27,7 +27,7 @@ from tmlattice.effects import (
 )
 from tmlattice.effects.directions import directions, kept_directions, ring_effect, sitting_on
 from tmlattice.lattice import Element, Ring
-from tmlattice.maps import LayerMaps, RingMaps, ring_maps
+from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
 
 MADE = 10_000
 """Changed layers in memory: some 20 MB."""
@@ -153,9 +153,12 @@ def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Ass
     if few and key in ring.memory:
         kept: Assembly = ring.memory[key]
         return kept
-    with_known = apply(ring, known) if known else ring
-    layers = LayerMaps(with_known, dimension)
-    maps = ring_maps(with_known, dimension, layers)
+    with_known = apply(ring, known)
+    layers = LayerMaps.of(ring, dimension)
+    maps = ring_maps(ring, dimension, layers)
+    if with_known is not ring:
+        layers, touched = layers.changed_to(with_known)
+        maps = changed_maps(maps, layers, touched)
     shared = {} if few else assembly(ring, (), dimension)._directions
     made = Assembly(ring, known, with_known, layers, maps, rf_of(ring), shared)
     if few:
@@ -174,13 +177,11 @@ class Group:
         number: int,
         shots: NDArray[np.intp],
         settings: Settings,
-        active: bool,
         there: Assembly,
     ) -> None:
         self.number = number
         self.shots = shots
         self.settings = settings
-        self.active = active
         self.there = there
         self.layers = Layers.of(there.maps, there.third)
         self.replaced = there.changed(settings)

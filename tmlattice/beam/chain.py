@@ -5,7 +5,7 @@
 >>> chain.track([[1e-5, 0, 1e-5, 0]], turns=500)        # [1, 501, 4]
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
@@ -75,7 +75,7 @@ def first_pass(weights: Sequence[Array], maps: RingMaps, start: Array) -> tuple[
 class LayerChain:
     """Common part of chains of layers: names, launches, tracking, the one-turn map.
 
-    A chain defines how its layers act on states (`_forward`, `_track`, `tangents`).
+    A chain defines how its layers act on states (`_forward`, `_track`, `linearised`).
     """
 
     maps: RingMaps
@@ -89,10 +89,14 @@ class LayerChain:
         """Fill history [block, 1:, n, lane] from history[:, 0]: the start of every turn."""
         raise NotImplementedError
 
+    def linearised(self) -> Callable[[Array], tuple[Array, Array]]:
+        """Return `tangents` as a function, of the weights as they are now."""
+        raise NotImplementedError
+
     def tangents(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
         d launch there, [layer + 2, n, n]."""
-        raise NotImplementedError
+        return self.linearised()(x)
 
     @property
     def dimension(self) -> int:
@@ -208,9 +212,9 @@ class LayerChain:
         x = np.zeros(self.dimension) if start is None else np.array(start, dtype=float)
         free = np.asarray(free, dtype=np.intp)
         rows = np.arange(len(free))
-        found = False
+        found, tangents = False, self.linearised()
         for _ in range(31):
-            path, total = self.tangents(x)
+            path, total = tangents(x)
             miss = (path[-1] - x)[rows] - turn
             if not (np.isfinite(miss).all() and np.isfinite(total[-1]).all()):
                 break
@@ -269,12 +273,16 @@ class Chain(LayerChain):
         turn = self.turn()
         sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
-    def tangents(self, x: Array) -> tuple[Array, Array]:
-        """Return what `LayerChain.tangents` states."""
+    def linearised(self) -> Callable[[Array], tuple[Array, Array]]:
+        """Return what `LayerChain.linearised` states."""
         turn, n = self.turn(), self.dimension
-        states = np.empty((1, turn.steps + 1, n))
-        tangents = np.empty((*states.shape, n))
-        states[0, 0], tangents[0, 0] = x, np.eye(n)
-        rf = NO_RF.exits, NO_RF.values
-        kernels.trajectories(0, 1, *turn.W, turn.curved, turn.third, *rf, states, tangents)
-        return states[0], tangents[0]
+        layers = (None,) * n, *turn.W, turn.curved, turn.third, NO_RF.exits, NO_RF.values
+
+        def tangents(x: Array) -> tuple[Array, Array]:
+            states = np.empty((1, turn.steps + 1, n))
+            total = np.empty((*states.shape, n))
+            states[0, 0], total[0, 0] = x, np.eye(n)
+            kernels.trajectories(0, 1, *layers, states, total)
+            return states[0], total[0]
+
+        return tangents

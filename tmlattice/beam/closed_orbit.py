@@ -101,13 +101,25 @@ class ResponseModel:
         ):
             raise ValueError("kicks of the orbit are [magnet, 2], and need six coordinates")
         self.ring = ring
-        self.layers = LayerMaps(ring, dimension)
+        # of a design they are remembered; of one of many changed rings they would not be freed
+        layers = ring.memory.get(("layers", dimension))
+        self.layers = LayerMaps(ring, dimension) if layers is None else layers
         self.orbit_kicks = orbit_kicks
         magnets = np.arange(len(ring.magnets))
         self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._chain = Chain(self.maps)
         self._close(frequency)
+
+    @classmethod
+    def of(cls, ring: Ring, dimension: int = 6) -> "ResponseModel":
+        """Return the model of a ring, remembered with it: for a design, which is asked for often.
+
+        Raises:
+            UnstableRingError: no closed orbit.
+        """
+        LayerMaps.of(ring, dimension)
+        return ring.remembered(("response", dimension), lambda: cls(ring, dimension))
 
     def at_frequency(self, frequency: float) -> "ResponseModel":
         """Return the same ring, with its maps, at another RF frequency (relative change).

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam import sweeps
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.rf import NO_RF, Cavities
@@ -37,12 +37,19 @@ def lost(states: Array, names: tuple[str, ...]) -> tuple[Lost, ...]:
         states: at the start and at every exit, turn by turn, [shot, step + 1, n].
         names: of the layers; a turn has one step more, the drift to its end.
     """
-    outside = ~np.all(np.abs(states[:, :, 0:3:2]) < APERTURE, axis=2)  # true for NaN
+    gone = outside(states)
     found = []
-    for shot in np.flatnonzero(outside.any(axis=1)):
-        turn, step = divmod(max(int(outside[shot].argmax()) - 1, 0), len(names) + 1)
+    for shot in np.flatnonzero(gone[:, -1]):
+        turn, step = divmod(max(int(gone[shot].argmax()) - 1, 0), len(names) + 1)
         found.append(Lost(int(shot), turn, names[min(step, len(names) - 1)]))
     return tuple(found)
+
+
+def outside(states: Array) -> Flags:
+    """Whether a beam [shot, step + 1, n] has left the aperture at or before each exit, [shot, step
+    + 1]; true for NaN."""
+    inside = np.abs(states[:, :, 0:3:2]).max(axis=2) < APERTURE
+    return ~np.logical_and.accumulate(inside, axis=1)
 
 
 def positions(launches: Array, turns: int, layers: Layers, cavities: Cavities = NO_RF) -> Array:

@@ -90,7 +90,8 @@ def stable_phase(ring: Ring, phase: float) -> float:
     """
     if ring.gamma > RELATIVISTIC:
         return phase
-    return phase if stated.slip(ring) > 0 else float(np.pi) - phase
+    slip = ring.remembered("slip", lambda: stated.slip(ring))
+    return phase if slip > 0 else float(np.pi) - phase
 
 
 def speed_of(ring: Ring) -> float:

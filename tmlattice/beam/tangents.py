@@ -15,13 +15,15 @@ from tmlattice.compiled import jit
 
 @jit
 def trajectories(  # type: ignore[no-untyped-def]
-    first, last, W0, W1, W2, curved, third, exits, rf, states, tangents
+    first, last, size, W0, W1, W2, curved, third, exits, rf, states, tangents
 ):
     """Fill states [shot, 1:] and tangents [shot, 1:] from states[:, 0] and tangents[:, 0].
 
-    Step k of a turn is that of `Layers`; `exits` and `rf` are those of `Cavities`.
+    Step k of a turn is that of `Layers`; `exits` and `rf` are those of `Cavities`; the length of
+    `size` is n, known when compiled.
     """
-    n, steps = states.shape[2], W0.shape[0]
+    n, steps = len(size), W0.shape[0]
+    slopes = np.empty((n, n))
     for shot in range(first, last):
         if len(exits):
             _cavities(0, exits, rf, states[shot, 0], tangents[shot, 0])
@@ -30,28 +32,26 @@ def trajectories(  # type: ignore[no-untyped-def]
             x, y = states[shot, k], states[shot, k + 1]
             before, after = tangents[shot, k], tangents[shot, k + 1]
             for a in range(n):
-                for j in range(n):
-                    after[a, j] = 0.0
-                total = W0[w, a]
-                m = 0
                 for i in range(n):
-                    slope = W1[w, a, i]
-                    value = W1[w, a, i]
-                    if curved[w]:
-                        # row i of the Jacobian: products (j, i) for j < i, (i, i), (i, j) for j > i
+                    slopes[a, i] = W1[w, a, i]
+            if curved[w]:
+                for a in range(n):
+                    m = 0
+                    for i in range(n):
                         for j in range(i, n):
-                            value += W2[w, a, m] * x[j]
+                            slopes[a, i] += W2[w, a, m] * x[j]
+                            slopes[a, j] += W2[w, a, m] * x[i]
                             m += 1
-                        for j in range(n):
-                            low, high = min(i, j), max(i, j)
-                            place = low * n - low * (low - 1) // 2 + high - low
-                            bend = W2[w, a, place] * x[j]
-                            slope += 2.0 * bend if i == j else bend
-                    total += value * x[i]
-                    if slope != 0.0:
-                        for j in range(n):
-                            after[a, j] += slope * before[i, j]
+            for a in range(n):
+                total = W0[w, a]
+                for i in range(n):  # a quadratic form is half of its slope
+                    total += 0.5 * (W1[w, a, i] + slopes[a, i]) * x[i]
                 y[a] = total
+                for j in range(n):
+                    total = 0.0
+                    for i in range(n):
+                        total += slopes[a, i] * before[i, j]
+                    after[a, j] = total
             bend_tangent(third[w], y, after)
             if len(exits):
                 _cavities(w + 1, exits, rf, y, after)
@@ -59,6 +59,33 @@ def trajectories(  # type: ignore[no-untyped-def]
                     y[4] += rf[3]
                     if k + 2 < states.shape[1]:
                         _cavities(0, exits, rf, y, after)
+
+
+@jit
+def read(shots, R0, R1, R2, where, states, tangents, beam, slopes):  # type: ignore[no-untyped-def]
+    """Fill, for some shots, the beam's positions [shot, reading, 2] at the read-outs, and slopes
+    [shot, reading, 2, n], their derivatives by the launch; `where` is that of `Model`."""
+    n = states.shape[2]
+    slope = np.empty(n)
+    for shot in shots:
+        for r in range(len(where)):
+            m, x, tangent = r % len(R0), states[shot, where[r]], tangents[shot, where[r]]
+            for p in range(2):
+                for i in range(n):
+                    slope[i] = R1[m, p, i]
+                    slopes[shot, r, p, i] = 0.0
+                pair = 0
+                for i in range(n):
+                    for j in range(i, n):
+                        slope[i] += R2[m, p, pair] * x[j]
+                        slope[j] += R2[m, p, pair] * x[i]
+                        pair += 1
+                total = R0[m, p]
+                for i in range(n):
+                    total += 0.5 * (R1[m, p, i] + slope[i]) * x[i]
+                    for j in range(n):
+                        slopes[shot, r, p, j] += slope[i] * tangent[i, j]
+                beam[shot, r, p] = total
 
 
 @jit

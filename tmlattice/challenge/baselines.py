@@ -68,8 +68,8 @@ def _weight_change(case: Case, start: Fit) -> Guesses:
     ring = ring_of(case.lattice)
     network = TaylorNetwork.from_ring(ring)
     shots = len(case.fit.shots)
-    launches = start.nuisances.reshape(-1, 5)[-shots:] * [1, 1, 1, 1, 0]  # a network of four
-    modelled = start.point.view[0].view.readings[-shots:]
+    launches = start.nuisances.reshape(-1, 5)[:shots] * [1, 1, 1, 1, 0]  # a network of four
+    modelled = start.point.view[0].view.readings
     ordered = case.fit.in_order_of(network.monitors)
     readings = ordered.readings[:, 0] - modelled + network.readings(launches[:, :4])
     orbit = Measurement(launches, readings[:, None], network.monitors, noise=ordered.noise)

@@ -23,6 +23,7 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.batch import fingerprint
 from tmlattice.diagnosis.kinds import KINDS
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, decoded, record_of
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError, plain, unknown_choice
 from tmlattice.files import output_file, write_json
@@ -120,7 +121,7 @@ class Truth:
             [shot, monitor, 2], m. A case of kinds has neither.
     """
 
-    name: str
+    name: str = field(metadata=HIDDEN)
     tier: str
     causes: tuple[Cause, ...]
     unknown: Mapping[str, Any] | None
@@ -130,9 +131,9 @@ class Truth:
     amplitude: float
     noise: float
     seed: int
-    launches: Mapping[str, Array]
-    clean: Mapping[str, Array]
-    alone: Mapping[str, float] = field(default_factory=dict)
+    launches: Mapping[str, Array] = field(metadata=HIDDEN)
+    clean: Mapping[str, Array] = field(metadata=HIDDEN)
+    alone: Mapping[str, float] = field(default_factory=dict, metadata=OPTIONAL)
 
 
 @lru_cache(maxsize=2)
@@ -146,7 +147,14 @@ def write_case(folder: Path, case: Case, truth: Truth) -> None:
     own = folder / "cases" / case.name
     for name, measurement in case.parts.items():
         write_measurement(own / name, measurement, force=True)
-    _write_truth(folder / "truth", truth)
+    secret = folder / "truth"
+    secret.mkdir(parents=True, exist_ok=True)
+    arrays = {f"launches_{k}": v for k, v in truth.launches.items()}
+    arrays |= {f"clean_{k}": v for k, v in truth.clean.items()}
+    with output_file(secret / f"{truth.name}.npz") as path, path.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    with output_file(secret / f"{truth.name}.json") as path:
+        write_json(path, {"format": TRUTH, "version": 1, **record_of(truth)})
     document = {
         "format": PUBLIC,
         "version": 1,
@@ -157,23 +165,6 @@ def write_case(folder: Path, case: Case, truth: Truth) -> None:
         **({"kinds": list(case.kinds)} if case.kinds else {}),
     }
     with output_file(own / "case.json") as path:
-        write_json(path, document)
-
-
-def _write_truth(folder: Path, truth: Truth) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    arrays = {f"launches_{k}": v for k, v in truth.launches.items()}
-    arrays |= {f"clean_{k}": v for k, v in truth.clean.items()}
-    with output_file(folder / f"{truth.name}.npz") as path, path.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
-    apart = {"name", "launches", "clean"} | ({"alone"} if not truth.alone else set())
-    document = {
-        "format": TRUTH,
-        "version": 1,
-        **{key: value for key, value in vars(truth).items() if key not in apart},
-        "causes": [vars(cause) for cause in truth.causes],
-    }
-    with output_file(folder / f"{truth.name}.json") as path:
         write_json(path, document)
 
 
@@ -290,21 +281,8 @@ def _truth(folder: Path, name: str) -> Truth:
         for key in arrays:
             kind, part = key.split("_", 1)
             (launches if kind == "launches" else clean)[part] = arrays[key]
-
-    def number(value: Any) -> float:
-        return float("nan") if value is None else float(value)
-
-    plain = ("tier", "unknown", "background", "amplitude", "noise", "seed")
-    return Truth(
-        name=name,
-        causes=tuple(Cause(**cause) for cause in secret["causes"]),
-        signal_to_noise=tuple(number(v) for v in secret["signal_to_noise"]),
-        total=number(secret["total"]),
-        launches=launches,
-        clean=clean,
-        alone={kind: number(v) for kind, v in secret.get("alone", {}).items()},
-        **{key: secret[key] for key in plain},
-    )
+    truth: Truth = decoded(Truth, {**secret, "name": name, "launches": launches, "clean": clean})
+    return truth
 
 
 def _read(path: Path, kind: str) -> dict[str, Any]:

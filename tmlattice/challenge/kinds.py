@@ -15,7 +15,8 @@ from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.challenge.case import BEFORE, Case, Truth, ring_of
 from tmlattice.challenge.draw import Draw
-from tmlattice.diagnosis.kinds import PartOptions, part_of, stacked
+from tmlattice.diagnosis.kinds import part_of, stacked
+from tmlattice.diagnosis.options import Options
 from tmlattice.effects import Cause, Effect, LaunchEffect, Settings, find, modelled
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
@@ -29,7 +30,7 @@ from tmlattice.machine.machine import StoredSimulation
 from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.machine.shots import stream
 from tmlattice.measurement import AnyMeasurement
-from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.observe.data import Data, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
 TIER_KINDS: Mapping[str, tuple[str, ...]] = {
@@ -111,7 +112,7 @@ def problem_of(
     background: Mapping[str, float],
 ) -> Problem:
     """Return measurements as a problem, with distributed errors of known sizes if there are any."""
-    options = PartOptions(ring, _places(ring, turns=True), DEFAULT)
+    options = Options(ring, _places(ring, turns=True), DEFAULT)
     first, then = (
         [part_of(label, one, options) for label, one in some.items()] for some in (measured, before)
     )
@@ -125,10 +126,9 @@ def problem_of_case(
     ring = ring_of(case.lattice)
     if case.kinds:
         return problem_of(ring, case.measured, case.before, background)
-    data = of_measurement(ring, case.fit)
-    if case.reference is not None:
-        data = joined(of_measurement(ring, case.reference, reference=True), data)
-    return _among(_first_turns(ring, data).with_fixed(given), ring, background)
+    first = of_measurement(ring, case.fit)
+    then = [] if case.reference is None else [of_measurement(ring, case.reference)]
+    return _among(_first_turns(ring, first, then).with_fixed(given), ring, background)
 
 
 def quiet_problem(
@@ -145,20 +145,26 @@ def quiet_problem(
         launches: true ones, those of a reference first, [shot, 5].
         noise: rms of a reading, m.
     """
-    active = np.arange(len(launches)) >= reference
-    readings = Model(ring, settings, active=active).readings(launches)
-    valid = np.isfinite(readings)
-    unknown = np.tile(UNKNOWN_LAUNCH, (len(launches), 1))
-    data = Data(
-        np.nan_to_num(readings), valid, np.full(readings.shape, noise), launches, unknown,
-        tuple(settings), 1, active,
-    )  # fmt: skip
-    return _among(_first_turns(ring, data), ring, background)
+    some = []
+    for shots in (slice(reference, None), slice(reference))[: 1 + bool(reference)]:
+        own = tuple(settings[shots])
+        readings = Model(ring, own).readings(launches[shots])
+        unknown = np.tile(UNKNOWN_LAUNCH, (len(own), 1))
+        some.append(Data(
+            np.nan_to_num(readings), np.isfinite(readings), np.full(readings.shape, noise),
+            launches[shots], unknown, own, 1,
+        ))  # fmt: skip
+    first, *then = some
+    return _among(_first_turns(ring, first, then), ring, background)
 
 
-def _first_turns(ring: Ring, data: Data) -> CombinedProblem:
-    model = Model(ring, data.settings, active=data.active)
-    return CombinedProblem.of([FirstTurns(model=model, data=data, places=_places(ring))])
+def _first_turns(ring: Ring, first: Data, then: Sequence[Data]) -> CombinedProblem:
+    """First turns, and those of a reference."""
+    own, *before = (
+        FirstTurns(model=Model(ring, data.settings), data=data, places=_places(ring))
+        for data in (first, *then)
+    )
+    return CombinedProblem.of([own], before)
 
 
 def _places(ring: Ring, turns: bool = False) -> dict[str, float]:
@@ -193,9 +199,9 @@ class Ruler:
         return self._norm(self.start.residual - point.residual)
 
     def size(self, change: Array) -> float:
-        """Return that of a change of the readings, of the last ones of the problem, m."""
+        """Return that of a change of the readings, of the first ones of the problem, m."""
         whole = np.zeros(self.problem.valid.size)
-        whole[-change.size :] = np.nan_to_num(change).ravel()
+        whole[: change.size] = np.nan_to_num(change).ravel()
         return self._norm(self.problem.as_rows(whole))
 
     def _norm(self, rows: Array) -> float:

@@ -107,7 +107,20 @@ def make(
     if tier not in TIERS:
         raise unknown_choice("tier", tier, TIERS)
     kinds = _kinds(tier, kinds)
-    _check(tier, kinds, reference, learnt, known_rms, bool(background))
+    if reference and tier != "B":
+        raise TmlatticeError("a reference is for tier B; leave --reference out")
+    if learnt and (tier != "B" or reference or known_rms):
+        raise TmlatticeError(
+            "--learnt is for tier B, without --reference or known rms; leave --learnt out"
+        )
+    if background and tier != "B" and not kinds:
+        raise TmlatticeError(
+            "distributed errors are for tier B and for those of kinds; leave --background out"
+        )
+    if known_rms and "orbit_response" in kinds:
+        raise TmlatticeError(
+            "an orbit response determines those rms by itself; leave known_rms out"
+        )
     if correctors is not None and not learnt:
         raise TmlatticeError("correctors are those of a learnt response; give --learnt too")
     everywhere = background or ({"all": None} if tier in ("B", "P") else {})
@@ -160,31 +173,6 @@ def make(
     with output_file(folder / "truth" / "made.json") as path:
         write_json(path, {"format": "tmlattice-challenge-made", "version": 1, **made})
     return dict(unreachable)
-
-
-def _check(
-    tier: str,
-    kinds: Sequence[str],
-    reference: bool,
-    learnt: bool,
-    known_rms: bool,
-    background: bool,
-) -> None:
-    """Raise if a tier does not have the requested options."""
-    if reference and tier != "B":
-        raise TmlatticeError("a reference is for tier B; leave --reference out")
-    if learnt and (tier != "B" or reference or known_rms):
-        raise TmlatticeError(
-            "--learnt is for tier B, without --reference or known rms; leave --learnt out"
-        )
-    if background and tier != "B" and not kinds:
-        raise TmlatticeError(
-            "distributed errors are for tier B and for those of kinds; leave --background out"
-        )
-    if known_rms and "orbit_response" in kinds:
-        raise TmlatticeError(
-            "an orbit response determines those rms by itself; leave known_rms out"
-        )
 
 
 def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Case:

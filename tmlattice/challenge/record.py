@@ -4,7 +4,6 @@ An answer is that of the diagnosis, the oracle or a baseline, in the diagnosis' 
 are within one monitor gap if at most one monitor is between them.
 """
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,7 +28,7 @@ class Places:
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
-        self.monitors = sorted(monitor.s for monitor in ring.monitors)
+        self.monitors = np.array([monitor.s for monitor in ring.monitors])
         self.s: dict[str, list[float]] = {}
         for element in ring.elements:
             self.s.setdefault(element.name, []).append(element.s)
@@ -40,10 +39,8 @@ class Places:
 
     def between(self, a: float, b: float) -> int:
         """Number of monitors strictly between two positions."""
-        low, high = min(a, b), max(a, b)
-        return max(
-            bisect_left(self.monitors, high - 1e-9) - bisect_right(self.monitors, low + 1e-9), 0
-        )
+        low, high = min(a, b) + 1e-9, max(a, b) - 1e-9
+        return int(np.sum((low < self.monitors) & (self.monitors < high)))
 
     def near(self, true: str | None, found: Sequence[float]) -> bool:
         """Whether one of the positions is within one monitor gap of one of the element's."""

@@ -42,14 +42,7 @@ def diagnose_case(case: Case) -> dict[str, Any]:
         before = diagnose(ring, case.learnt)
         found = diagnose(before.as_found, case.fit, known=known_of(before))
         return {**found.as_json(), "seconds": time.perf_counter() - begun}
-    found = diagnose(
-        ring,
-        case.fit,
-        heldout=case.heldout,
-        reference=case.reference,
-        background=case.options.get("background"),
-        effects=case.options.get("effects"),
-    )
+    found = diagnose(ring, case.fit, heldout=case.heldout, reference=case.reference, **case.options)
     return {**found.as_json(), "seconds": time.perf_counter() - begun}
 
 

@@ -42,10 +42,10 @@ from tmlattice.challenge.record import (
 )
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError, plain
-from tmlattice.inference.validation import held_out_gap
+from tmlattice.inference.validation import held_out_gap, predicted
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import of_measurement
-from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
+from tmlattice.observe.first_turns import FirstTurns
 
 log = logging.getLogger(__name__)
 
@@ -91,8 +91,17 @@ def score(
         raise TmlatticeError(failed[names[0]])
     others = sorted(set(case_names(folder)) - set(names))
     names = list(truths)
-    where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
-    evaluated, guessed = _others(folder, described, truths, lattice, where) if oracle else ({}, {})
+    evaluated, guessed = dict[str, dict[str, Any]](), dict[str, dict[str, Any]]()
+    if oracle:
+        where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
+        cases = {name: partial(trusted_case, folder, name, lattice) for name in truths}
+        both = {
+            name: partial(lambda load, truth: (load(), truth), cases[name], truth)
+            for name, truth in truths.items()
+        }
+        evaluated = run_batch(evaluate, both, folder / "oracle", **where)
+        if described["tier"] != "E":  # they always find something
+            guessed = run_batch(baselines, cases, folder / "baselines", **where)
     ring = ring_of(described["lattice"])
     places = Places(ring)
     rows = []
@@ -127,25 +136,6 @@ def score(
         **summary(rows, described["tier"]),
         "rows": rows,
     }
-
-
-def _others(
-    folder: Path,
-    described: Mapping[str, Any],
-    truths: Mapping[str, Truth],
-    lattice: str | None,
-    where: Mapping[str, Any],
-) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Oracle and simple methods, by case."""
-
-    def load(name: str) -> Callable[[], tuple[Case, Truth]]:
-        return lambda: (trusted_case(folder, name, lattice), truths[name])
-
-    evaluated = run_batch(evaluate, {n: load(n) for n in truths}, folder / "oracle", **where)
-    if described["tier"] == "E":  # they always find something
-        return evaluated, {}
-    cases = {n: partial(trusted_case, folder, n, lattice) for n in truths}
-    return evaluated, run_batch(baselines, cases, folder / "baselines", **where)
 
 
 # --- a case ---------------------------------------------------------------------------------------
@@ -282,5 +272,5 @@ def clean_gap(
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
     found = replace(design, fixed=tuple(causes))
-    gap = held_out_gap([held_out_residuals(problem) for problem in (design, found)])
+    gap = held_out_gap([predicted(problem)[0] for problem in (design, found)])
     return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}

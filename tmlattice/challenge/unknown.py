@@ -1,6 +1,8 @@
 """Faults outside the catalogue, tracked by AT."""
 
-from collections.abc import Callable, Mapping, Sequence
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,12 +37,12 @@ class _WithOctupole(AtEngine):
 
     def __init__(self, ring: Ring, element: str, strength: float) -> None:
         super().__init__(ring)
-        magnet = self._line[self._places[ring.index(element)].start]
-        field = list(magnet.PolynomB) + [0.0] * (4 - len(magnet.PolynomB))
-        field[3] += strength / magnet.Length / 6  # AT: k_n / n!
-        magnet.PolynomA = np.zeros(4)
-        magnet.PolynomB = np.array(field)
-        magnet.MaxOrder = 3
+        place = self._places[ring.index(element)].start
+        magnet = self._line[place] = copy.deepcopy(self._line[place])  # the ring remembers its own
+        field = np.pad(magnet.PolynomB, (0, 4 - len(magnet.PolynomB)))
+        magnet.PolynomA, magnet.PolynomB = np.zeros(4), field
+        magnet.MaxOrder = 3  # before there is a field of that order, of which AT would warn
+        magnet.PolynomB = field + np.array([0, 0, 0, strength / magnet.Length / 6])  # k_n / n!
 
 
 class Unknown:
@@ -68,36 +70,25 @@ class Unknown:
 
     def readings(self, amount: float) -> Array:
         """Return readings without noise, [shot, monitor, 2], m."""
-        by_kind: dict[str, Callable[[float], Array]] = {
-            "hysteresis": self._hysteresis,
-            "octupole": self._octupole,
-            "kick_jitter": self._jitter,
-        }
-        return by_kind.get(self.kind, self._misread)(amount)
-
-    def _hysteresis(self, amount: float) -> Array:
-        out = np.empty_like(self.clean)
-        for sign in (-1.0, 1.0):
-            cause = Cause("quadrupole_gradient", self.element.name, sign * amount)
-            chosen = np.flatnonzero(self.sign == sign)
-            out[chosen] = clean_readings(Machine(self.ring, [cause]), self.shots)[chosen]
-        return out
-
-    def _octupole(self, amount: float) -> Array:
-        engine = _WithOctupole(self.ring, self.element.name, amount)
-        return engine.track(self.shots.launches, 1, self.shots.settings)[:, 0]
-
-    def _jitter(self, amount: float) -> Array:
-        settings: list[Settings] = []
-        for setting, draw in zip(self.shots.settings, self.draw, strict=True):
-            own = dict(setting.get(self.element.name, {"kick": self.element.angle}))
-            own["kick"] += float(amount * draw)
-            settings.append({**setting, self.element.name: own})
-        shots = Shots(self.shots.nominal, self.shots.launches, self.shots.sigma, tuple(settings))
-        return clean_readings(Machine(self.ring), shots)
-
-    def _misread(self, amount: float) -> Array:
         out = self.clean.copy()
+        match self.kind:
+            case "hysteresis":
+                for sign in (-1.0, 1.0):
+                    cause = Cause("quadrupole_gradient", self.element.name, sign * amount)
+                    chosen = np.flatnonzero(self.sign == sign)
+                    out[chosen] = clean_readings(Machine(self.ring, [cause]), self.shots)[chosen]
+                return out
+            case "octupole":
+                engine = _WithOctupole(self.ring, self.element.name, amount)
+                return engine.track(self.shots.launches, 1, self.shots.settings)[:, 0]
+            case "kick_jitter":
+                settings: list[Settings] = []
+                for setting, draw in zip(self.shots.settings, self.draw, strict=True):
+                    own = dict(setting.get(self.element.name, {"kick": self.element.angle}))
+                    own["kick"] += float(amount * draw)
+                    settings.append({**setting, self.element.name: own})
+                shots = replace(self.shots, settings=tuple(settings))
+                return clean_readings(Machine(self.ring), shots)
         at = [monitor.name for monitor in self.ring.monitors].index(self.element.name)
         x, y = self.clean[:, at].T
         if self.kind == "monitor_cubic":

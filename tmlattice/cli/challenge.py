@@ -144,7 +144,7 @@ def score(
     """Score the results in FOLDER against the truth, together with oracle and baselines."""
     from tmlattice.challenge import score as score_cases
 
-    with outputs(out, json_file) as (figures, write):
+    with outputs(out, json_file) as (figures, _, write):
         result = score_cases(
             folder, oracle=oracle, progress=not is_quiet(), lattice=lattice, **workers
         )

@@ -1,7 +1,6 @@
 """`tmlattice check`: what is wrong with a measurement as a whole."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -18,9 +17,6 @@ from tmlattice.cli.options import (
     radiation_option,
     read_data,
 )
-
-if TYPE_CHECKING:
-    from tmlattice.diagnosis.signals import Checkup
 
 
 @click.command("check", cls=OfMachine)
@@ -44,7 +40,10 @@ def check(
     stated ones; silent, frozen and copied BPMs; and outliers. MEASUREMENT is a folder of any
     kind. The exit code is 0 if the data can be diagnosed, and 1 if they must be corrected first.
     """
-    with outputs(None, json_file) as (_, write):
+    with outputs(None, json_file) as (*_, write):
+        from rich.box import SIMPLE_HEAD
+        from rich.table import Table
+
         from tmlattice.diagnosis.data_checks import check_data
 
         ring = open_ring(lattice)
@@ -54,15 +53,6 @@ def check(
         document = found.as_json()
         document["provenance"] = {**document["provenance"], "measurement": str(measurement)}
         write(document)
-    _print(found, json_file)
-    if found.status == "wrong":
-        context.exit(1)
-
-
-def _print(found: "Checkup", json_file: Path | None) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     screen = console()
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_header=False)
     for own in found.checks:
@@ -72,3 +62,5 @@ def _print(found: "Checkup", json_file: Path | None) -> None:
     screen.print(f"{made['lattice']}: {len(found.checks)} checks, {made['seconds']:.1f} s")
     if json_file:
         screen.print(f"written: {json_file}")
+    if found.status == "wrong":
+        context.exit(1)

@@ -11,7 +11,7 @@ import warnings
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn
 
 import click
 
@@ -23,7 +23,7 @@ from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import effects, info
 from tmlattice.cli.init import init
-from tmlattice.cli.options import FILE, lattice_options
+from tmlattice.cli.options import FILE
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
 from tmlattice.cli.reproduce import reproduce
@@ -113,7 +113,16 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
               help="Machine file: lattice, names, units, supplies; else tmlattice.toml of the "
               "working directory, if there is one. For every command.")  # fmt: skip
 @click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors. For every command.")
-@lattice_options
+@click.option("--sequence", metavar="NAME", help="The sequence, line or variable of the lattice "
+              "file that is the ring.")  # fmt: skip
+@click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
+              help="Beam energy, if the lattice states none.")  # fmt: skip
+@click.option("--particle", type=click.Choice(["electron", "proton"]), metavar="NAME",
+              help="electron or proton, if the lattice states none.")  # fmt: skip
+@click.option("--monitors", multiple=True, metavar="PATTERN", help="Markers or drifts that are "
+              "BPMs, such as 'BPM*'; several with commas.")  # fmt: skip
+@click.option("--correctors", multiple=True, metavar="PATTERN",
+              help="Elements that are correctors too, such as 'COR*'.")  # fmt: skip
 @click.pass_context
 def tmlattice(
     context: click.Context, /, machines: tuple[Path, ...], quiet: bool, **lattice: Any
@@ -153,13 +162,13 @@ def main() -> NoReturn:
         click.echo(error.format_message())
         sys.exit(BAD_INPUT)
     except click.ClickException as error:
-        _fail(error.format_message(), BAD_INPUT)
+        _fail(error.format_message())
     except TmlatticeError as error:
-        _fail(str(error), BAD_INPUT)
+        _fail(str(error))
     except csv.Error as error:
-        _fail(f"a table cannot be read as CSV ({error}); write it again", BAD_INPUT)
+        _fail(f"a table cannot be read as CSV ({error}); write it again")
     except MemoryError:
-        _fail("there is not enough memory for this; give less of it", BAD_INPUT)
+        _fail("there is not enough memory for this; give less of it")
     except (
         BrokenPipeError,
         SystemExit,
@@ -167,7 +176,7 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still to be flushed
         sys.exit(128 + signal.SIGPIPE)
     except OSError as error:
-        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
     except (KeyboardInterrupt, click.exceptions.Abort, Terminated) as stop:
         where = f" in '{stopped_in[0]}'" if stopped_in else ""
         with suppress(OSError):  # the terminal may be gone
@@ -219,18 +228,11 @@ def _spelt(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(SPELT, _spelt)
 
 
-def _fail(message: str, code: int) -> NoReturn:
+def _fail(message: str) -> NoReturn:
     click.echo(f"tmlattice: {harmless(message)}", err=True)
-    sys.exit(code)
+    sys.exit(BAD_INPUT)
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are checked elsewhere
         click.echo(f"tmlattice: warning: {harmless(str(message))}", err=True)

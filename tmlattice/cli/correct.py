@@ -96,7 +96,7 @@ def correct(
     from tmlattice.files import output_file
     from tmlattice.report.speaking import write_correction
 
-    with outputs(out, json_file) as (folder, write):
+    with outputs(out, json_file) as (folder, _, write):
         turns = _first_turns(estimated)
         path, start = (estimated[0], design) if turns else _sources(estimated[0], design)
         machine = machine_file()

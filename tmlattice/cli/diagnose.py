@@ -135,6 +135,7 @@ def diagnose(
     from tmlattice.diagnosis.load import ESTIMATED_FILE
     from tmlattice.diagnosis.twin import knowledge_file, known_of
     from tmlattice.errors import LatticeError
+    from tmlattice.files import write_json
     from tmlattice.report.text import wrapped
 
     kept = [Path(ESTIMATED_FILE)]
@@ -142,7 +143,7 @@ def diagnose(
         kept.append(Path(lattice_out.name))
     with_companions = [(own, calibration_beside(own), knowledge_file(own)) for own in kept]
     replaced = [*FILES, *(str(own) for files in with_companions for own in files)]
-    with outputs(out, json_file, replaced) as (folder, write):
+    with outputs(out, json_file, replaced) as (folder, place, write):
         from tmlattice.correction.applied import applied
         from tmlattice.correction.applied import sentence as of_device
         from tmlattice.correction.knobs import read_settings
@@ -194,10 +195,6 @@ def diagnose(
         if lattice_out and lattice_out == corrected_out:
             raise click.UsageError(f"--lattice-out and --corrected-out are both '{lattice_out}'")
 
-        def place(path: Path) -> Path:
-            """Where it is written: a file of --out while that folder is filled."""
-            return folder / path.name if folder and is_in(path, out) else path
-
         for option, path in (("lattice", lattice_out), ("corrected", corrected_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path, place)
@@ -240,7 +237,10 @@ def diagnose(
         write(document)
         written = _save_rings(result, known, lattice_out, corrected_out, place)
         if folder and reading:
-            _write_weights(reading, folder)
+            from tmlattice.plots import plot_weights, save_figure
+
+            save_figure(plot_weights(reading), folder / "weights.png")
+            write_json(folder / "weights.json", reading.as_json())
     screen, after = console(), []
     if correction is not None:
         after = ["", *wrapped(f"Correction: {correction.words}", "", screen.width)]
@@ -425,14 +425,6 @@ def _weights(
     return read_network(ring, load_network(ring, path), assume(data, assumed, names))
 
 
-def _write_weights(reading: "WeightReading", folder: Path) -> None:
-    from tmlattice.files import write_json
-    from tmlattice.plots import plot_weights, save_figure
-
-    save_figure(plot_weights(reading), folder / "weights.png")
-    write_json(folder / "weights.json", reading.as_json())
-
-
 def _weights_text(ring: "Ring", reading: "WeightReading") -> str:
     magnets = ring.magnets
     raw, score = (magnets[int(reading.places(by)[0])] for by in ("raw", "score"))
@@ -453,7 +445,7 @@ def _extent(result: "Diagnosis") -> str:
     elif result.kind == "trajectory":
         view = result.trajectories
         what = (
-            f"{int(view.data.active.sum())} shots in the fit, {len(result.heldout_shots)} held "
+            f"{view.data.shots} shots in the fit, {len(result.heldout_shots)} held "
             f"out, {len(view.explanation.first.hypotheses)} hypotheses"
         )
     else:

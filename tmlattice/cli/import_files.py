@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import click
 
 from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring, path_option
-
-if TYPE_CHECKING:
-    from tmlattice.importers import Imported
 
 
 @click.command("import", cls=OfMachine)
@@ -78,7 +75,7 @@ def import_files(
         return
     if not files:
         raise click.UsageError("name the FILES to import, or --example for a template of each")
-    from tmlattice.importers import Options, bring_in, write_imported
+    from tmlattice.importers import Options, bring_in, described, write_imported
     from tmlattice.measurement.write import check_free
 
     check_free(out, force)
@@ -98,7 +95,17 @@ def import_files(
         )
     brought = bring_in(files, options)
     write_imported(brought, out, force)
-    _print(brought, out)
+    screen = console()
+    screen.print(described(brought))
+    for sentence in brought.assumed:
+        screen.print(f"- {sentence}")
+    if brought.doubts:
+        screen.print("the data contradict:")
+        for sentence in brought.doubts:
+            screen.print(f"! {sentence}")
+    screen.print(f"written: {out}")
+    if brought.ring is not None:
+        screen.print(f"next: tmlattice diagnose {out / 'lattice.json'} {out}")
 
 
 def _example(lattice: str, out: Path) -> None:
@@ -120,19 +127,3 @@ def _example(lattice: str, out: Path) -> None:
         f"next: tmlattice diagnose {out / 'readings_wide.csv'} --machine {out / 'tmlattice.toml'}",
         soft_wrap=True,
     )
-
-
-def _print(brought: "Imported", out: Path) -> None:
-    from tmlattice.importers import described
-
-    screen = console()
-    screen.print(described(brought))
-    for sentence in brought.assumed:
-        screen.print(f"- {sentence}")
-    if brought.doubts:
-        screen.print("the data contradict:")
-        for sentence in brought.doubts:
-            screen.print(f"! {sentence}")
-    screen.print(f"written: {out}")
-    if brought.ring is not None:
-        screen.print(f"next: tmlattice diagnose {out / 'lattice.json'} {out}")

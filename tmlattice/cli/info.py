@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @json_option
 def info(lattice: str, json_file: Path | None) -> None:
     """Print counts, length, tunes, chromaticity and betas of LATTICE."""
-    with outputs(None, json_file) as (_, write):
+    with outputs(None, json_file) as (*_, write):
         facts = _facts(open_ring(lattice, read=False))
         write(facts)
     _print(facts)

@@ -124,10 +124,12 @@ def seed_option(purpose: str) -> Callable[[Callable[..., Any]], Callable[..., An
 
 INPUTS = (
     "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
-    "settings", "network", "files", "estimated", "design", "goal", "knobs",
+    "settings", "network", "files", "estimated", "design", "goal", "knobs", "first", "second",
 )  # fmt: skip
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "corrected_out", "example_file")
+DIAGNOSES = ("estimated", "first", "second")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv", "tunes.csv")
+OF_DIAGNOSES = ("diagnosis.json", "diagnosis.lattice.json", "estimated.json")
 OF_FOLDERS = ("challenge.json", "options.json")
 OF_BATCHES = ("cases", "truth", "results", "oracle", "baselines")
 
@@ -139,21 +141,22 @@ class Careful(click.Command):
         """Run it, unless an output is an input or another output; OutputError: it is."""
         from tmlattice.files import OutputError
 
-        values = [ctx.params.get(name) for name in INPUTS]
-        given = [v for value in values for v in (value if isinstance(value, tuple) else [value])]
+        def given(names: Sequence[str]) -> list[Path]:
+            values = [ctx.params.get(name) for name in names]
+            each = [v for own in values for v in (own if isinstance(own, tuple) else [own])]
+            return [Path(str(value)) for value in each if value]
+
         folder = ctx.params.get("folder")
-        machine = machine_file()
+        paths, machine = given(INPUTS), machine_file()
         if machine is not None:
-            given += [machine.path, machine.lattice]
-            given += [machine.supplies] if isinstance(machine.supplies, Path) else []
-        paths = [Path(str(value)) for value in given if value]
-        read = {key for path in paths for key in _identities(path)}
-        for path in paths:
-            read |= {key for name in OF_MEASUREMENTS for key in _identities(path / name)}
-            read |= _identities(Path(f"{path}.known.json"))
+            paths += [machine.path, *([Path(machine.lattice)] if machine.lattice else [])]
+            paths += [machine.supplies] if isinstance(machine.supplies, Path) else []
+        files = [*paths, *(Path(f"{path}.known.json") for path in paths)]
+        files += [path / name for path in paths for name in OF_MEASUREMENTS]
+        files += [path / name for path in given(DIAGNOSES) for name in OF_DIAGNOSES]
         if folder or ctx.params.get("out"):
-            own = Path(folder or ctx.params["out"])
-            read |= {key for name in OF_FOLDERS for key in _identities(own / name)}
+            files += [Path(folder or ctx.params["out"]) / name for name in OF_FOLDERS]
+        read = {key for path in files for key in _identities(path)}
         written: set[Any] = set()
         for name in OUTPUTS:
             out = ctx.params.get(name)
@@ -247,27 +250,6 @@ STATED = {"--unit": "[data]", "--noise": "[data]", "--map": "[channels]"}
 """Options that a machine file takes the place of, and where it states them."""
 HINT = ", or state it in a machine file (`tmlattice init LATTICE` writes one)"
 _MACHINE = "tmlattice.machine"
-
-
-LATTICE_OPTIONS = (
-    click.option("--sequence", metavar="NAME", help="The sequence, line or variable of the lattice "
-                 "file that is the ring."),
-    click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
-                 help="Beam energy, if the lattice states none."),
-    click.option("--particle", type=click.Choice(["electron", "proton"]), metavar="NAME",
-                 help="electron or proton, if the lattice states none."),
-    click.option("--monitors", multiple=True, metavar="PATTERN", help="Markers or drifts that are "
-                 "BPMs, such as 'BPM*'; several with commas."),
-    click.option("--correctors", multiple=True, metavar="PATTERN",
-                 help="Elements that are correctors too, such as 'COR*'."),
-)  # fmt: skip
-
-
-def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """How the LATTICE is read, for every command; a machine file states it once and for all."""
-    for option in reversed(LATTICE_OPTIONS):
-        function = option(function)
-    return function
 
 
 def stated_options() -> dict[str, Any]:
@@ -407,22 +389,24 @@ json_option = path_option("--json", "json_file", help="Write the result as JSON.
 @contextmanager
 def outputs(
     folder: Path | None, json_file: Path | None, replaced: Collection[str] = ()
-) -> Iterator[tuple[Path | None, Callable[[Any], None]]]:
+) -> Iterator[tuple[Path | None, Callable[[Path], Path], Callable[[Any], None]]]:
     """What a command writes: all of it when it ends well, else nothing.
 
-    Yields the folder that is filled (None: none was asked for), and the function that writes the
-    result as JSON, where that was asked for. Older files of the folder with names of `replaced` are
-    removed if they are not written again.
+    Yields the folder that is filled (None: none was asked for), the place where a file is written
+    (one of the folder: in that which is filled), and the function that writes the result as JSON,
+    where that was asked for. Older files of the folder with names of `replaced` are removed if they
+    are not written again.
     """
     from tmlattice.files import output_file, output_folder, write_json
 
     with ExitStack() as files:
         made = files.enter_context(output_folder(folder, replaced)) if folder else None
-        path = None
-        if json_file:
-            place = made / json_file.name if made and is_in(json_file, folder) else json_file
-            path = files.enter_context(output_file(place))
-        yield made, lambda result: write_json(path, result) if path else None
+
+        def place(path: Path) -> Path:
+            return made / path.name if made and is_in(path, folder) else path
+
+        path = files.enter_context(output_file(place(json_file))) if json_file else None
+        yield made, place, lambda result: write_json(path, result) if path else None
 
 
 def is_in(path: Path, folder: Path | None) -> bool:

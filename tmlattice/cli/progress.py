@@ -4,7 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 AFTER = 3.0
@@ -73,10 +73,7 @@ def shown(name: str, quiet: bool = False) -> Iterator[None]:
     line = Line(name)
     _shown.append(line)
     try:
-        if quiet:
-            yield
-            return
-        with line:
+        with nullcontext() if quiet else line:
             yield
     except KeyboardInterrupt:
         stopped_in[:] = [line.stage] * bool(line.stage)

@@ -1,6 +1,5 @@
 """`tmlattice dev reproduce`: the paper's other systems, its figures compared with ours."""
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +12,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tmlattice.systems import Comparison
-
-    Reproduced = tuple[list[Comparison], Figure]
 
 SEED = 0
 """Of noise and of first weights."""
@@ -45,7 +42,7 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool) -> None:
         entries = []
         for name in chosen:
             begin = perf_counter()
-            rows, figure = _RUN[name](small, not is_quiet())
+            rows, figure = _reproduced(name, small)
             save_figure(figure, folder / f"{name}.png")
             entries.append({
                 "system": name,
@@ -66,58 +63,35 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool) -> None:
     console().print(f"written: {out}/: {names}, reproduction.json")
 
 
-def _free_fall(small: bool, progress: bool) -> "Reproduced":
-    from tmlattice.plots.systems import plot_free_fall
-    from tmlattice.systems.free_fall import comparisons, predicted_masses, step_errors
+def _reproduced(name: str, small: bool) -> "tuple[list[Comparison], Figure]":
+    """Our numbers next to the paper's, and the figure of a system."""
+    from tmlattice.plots import systems as plots
+    from tmlattice.systems import cavitation, free_fall, lotka_volterra, magnets, pendulum
 
-    errors = step_errors([1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01][: 4 if small else None])
-    masses = predicted_masses([60, 70, 90, 120, 150], seed=SEED)
-    return comparisons(errors, masses), plot_free_fall(errors, masses)
+    less: dict[str, Any]
+    match name:
+        case "free-fall":
+            steps = [1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01]
+            errors = free_fall.step_errors(steps[:4] if small else steps)
+            masses = free_fall.predicted_masses([60, 70, 90, 120, 150], seed=SEED)
+            return free_fall.comparisons(errors, masses), plots.plot_free_fall(errors, masses)
+        case "lotka-volterra":
+            less = {"epochs": (100,), "cells": (5,), "regularizations": ("none",)} if small else {}
+            race = lotka_volterra.race(seed=SEED, progress=not is_quiet(), **less)
+            return lotka_volterra.comparisons(race), plots.plot_lotka_volterra(race)
+        case "pendulum":
+            swings = pendulum.study(SEED)
+            return pendulum.comparisons(swings), plots.plot_pendulum(swings)
+        case "magnets":
+            from tmlattice.lattice import load_ring
 
-
-def _lotka_volterra(small: bool, progress: bool) -> "Reproduced":
-    from tmlattice.plots.systems import plot_lotka_volterra
-    from tmlattice.systems.lotka_volterra import comparisons, race
-
-    smaller: dict[str, Any] = {"epochs": (100,), "cells": (5,), "regularizations": ("none",)}
-    done = race(seed=SEED, progress=progress, **(smaller if small else {}))
-    return comparisons(done), plot_lotka_volterra(done)
-
-
-def _pendulum(small: bool, progress: bool) -> "Reproduced":
-    from tmlattice.plots.systems import plot_pendulum
-    from tmlattice.systems.pendulum import comparisons, study
-
-    done = study(SEED)
-    return comparisons(done), plot_pendulum(done)
-
-
-def _magnets(small: bool, progress: bool) -> "Reproduced":
-    from tmlattice.lattice import load_ring
-    from tmlattice.plots.systems import plot_magnets
-    from tmlattice.systems.magnets import comparisons, study
-
-    ring = load_ring("petra3")
-    done = study(ring)
-    return comparisons(done), plot_magnets(done, ring)
-
-
-def _cavitation(small: bool, progress: bool) -> "Reproduced":
-    from tmlattice.plots.systems import plot_cavitation
-    from tmlattice.systems.cavitation import comparisons, study
-
-    smaller: dict[str, Any] = {"drive": 0.5, "periods": 1, "order": 5}
-    done = study(seed=SEED, **(smaller if small else {}))
-    return comparisons(done), plot_cavitation(done)
-
-
-_RUN: dict[str, Callable[[bool, bool], "Reproduced"]] = {
-    "free-fall": _free_fall,
-    "lotka-volterra": _lotka_volterra,
-    "pendulum": _pendulum,
-    "magnets": _magnets,
-    "cavitation": _cavitation,
-}
+            ring = load_ring("petra3")
+            turns = magnets.study(ring)
+            return magnets.comparisons(turns), plots.plot_magnets(turns, ring)
+        case _:
+            less = {"drive": 0.5, "periods": 1, "order": 5} if small else {}
+            collapse = cavitation.study(seed=SEED, **less)
+            return cavitation.comparisons(collapse), plots.plot_cavitation(collapse)
 
 
 def _print(name: str, rows: "list[Comparison]") -> None:

@@ -46,7 +46,7 @@ def compare(first: str, second: str, json_file: Path | None) -> None:
     """
     from tmlattice.report.compare import compare as run
 
-    with outputs(None, json_file) as (_, write):
+    with outputs(None, json_file) as (*_, write):
         found = run(first, second)
         write(found.as_json())
     print_report(console(), found, [f"written: {json_file}"] if json_file else [])

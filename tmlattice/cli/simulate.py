@@ -71,14 +71,12 @@ CAUSE = Word(
 @click.option(
     "--shots",
     type=click.IntRange(1),
-    default=6,
     show_default="6 of first turns, else 1",
     help="How many.",
 )
 @click.option(
     "--turns",
     type=click.IntRange(1),
-    default=1,
     show_default="1, and 1000 turn by turn",
     help="Read in each shot.",
 )
@@ -169,12 +167,8 @@ def simulate(
     options["background"] = dict(options["background"])
     options["correctors"] = options["correctors"] or None
     options["settings"] = _settings(options["settings"])
-    options = {name: v for name, v in options.items() if name in OF_ALL | KINDS[kind]}
-    if options["noise"] is None:
-        del options["noise"]
-    for name in ("shots", "turns"):  # the command's defaults are those of first turns
-        if kind != "trajectory" and not _is_given(context, name):
-            options.pop(name, None)
+    options = {name: value for name, value in options.items()
+               if name in OF_ALL | KINDS[kind] and value is not None}  # fmt: skip
     with ExitStack() as both:  # the folder and the truth, or neither
         file = None if truth is None else both.enter_context(output_file(truth))
         simulation, sentence = _run(kind, ring, causes, options)
@@ -203,7 +197,7 @@ def _run(kind: str, ring: Any, causes: list[Any], options: dict[str, Any]) -> tu
     if kind == "trajectory":
         made = simulate(ring, causes, **options)
         return made, (
-            f"{options['shots']} shots of {options['turns']} turn(s), {monitors}, "
+            f"{len(made.shots)} shots of {made.turns} turn(s), {monitors}, "
             f"{1e3 * options['amplitude']:g} mm rms, noise {1e6 * made.machine.noise[0]:g} µm, "
             f"engine {options['engine']}"
         )
@@ -235,18 +229,13 @@ def _run(kind: str, ring: Any, causes: list[Any], options: dict[str, Any]) -> tu
     return made, f"{len(made.measured.shots)} reading(s) of the tunes, engine at"
 
 
-def _is_given(context: click.Context, name: str) -> bool:
-    """Whether the command line states an option."""
-    return context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
-
-
 def _check_options(context: click.Context, kind: str) -> None:
     """Refuse what other kinds of measurement have."""
-    of_kinds = set().union(*KINDS.values())
     for option in context.command.params:
         name = option.name or ""
-        if _is_given(context, name) and name in of_kinds and name not in KINDS[kind]:
-            kinds = [other for other, own in KINDS.items() if name in own]
+        given = context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
+        kinds = [other for other, own in KINDS.items() if name in own]
+        if given and kinds and kind not in kinds:
             raise click.UsageError(
                 f"{option.opts[0]} has no meaning for --kind {kind}; take it out, or give "
                 f"--kind {' or '.join(kinds)}"

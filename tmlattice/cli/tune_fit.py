@@ -117,7 +117,7 @@ def tune_fit(
                 )
     from tmlattice.files import write_json
 
-    with outputs(out, json_file) as (folder, write):
+    with outputs(out, json_file) as (folder, _, write):
         options["methods"] = methods or METHODS
         from tmlattice.fitting import tune_fit as run
         from tmlattice.network import save_network

@@ -175,23 +175,17 @@ def _refusal(gain: float, error: float) -> str:
 
 def _intervals(point: Point) -> dict[str, Any]:
     """Of the rms of each target over the draws."""
-    open_, errors = point.open, point.errors
-    found = {}
-    for name in errors:
-        rms = rms_of({name: errors[name] + open_[name]})[name]
-        ends = np.percentile(rms, INTERVAL, axis=0)
-        found[name] = tuple(tuple(ends[:, p].tolist()) for p in (0, 1))
-    return found
+    drawn = {name: errors + point.open[name] for name, errors in point.errors.items()}
+    return {name: tuple(map(tuple, np.percentile(rms, INTERVAL, axis=0).T.tolist()))
+            for name, rms in rms_of(drawn).items()}  # fmt: skip
 
 
 def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     """Median rms of the targets with these amounts, linear about the end."""
-    found = {}
-    for name in end.problem.targets.names:
-        change = np.tensordot(amounts - end.amounts, end.by_knobs[name], 1)
-        errors = end.errors[name] + change + end.open[name]
-        found[name] = pair(np.median(rms_of({name: errors})[name], axis=0))
-    return found
+    change = amounts - end.amounts
+    drawn = {name: end.errors[name] + np.tensordot(change, end.by_knobs[name], 1) + end.open[name]
+             for name in end.problem.targets.names}  # fmt: skip
+    return {name: pair(np.median(rms, axis=0)) for name, rms in rms_of(drawn).items()}
 
 
 def _warnings(

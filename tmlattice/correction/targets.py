@@ -219,7 +219,7 @@ class Targets(Weighted):
             raise TmlatticeError(
                 f"'{THREADING}' is the target of a beam that is not stored; give it alone"
             )
-        model = ResponseModel(goal)
+        model = ResponseModel.of(goal)
         self.s = np.array([monitor.s for monitor in goal.monitors])
         self.step = ENERGY / float(model.rf_start[5])
         self.goal = StoredOptics(model, self.step).values

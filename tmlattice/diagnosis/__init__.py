@@ -15,13 +15,16 @@ import numpy as np
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis.data_checks import in_the_lattice
 from tmlattice.diagnosis.kinds import kind_of
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.common_factors import MAX_CHOSEN
 from tmlattice.inference.distributed import DistributedErrors
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import AnyMeasurement, Measurement, OrbitResponse, in_words
 from tmlattice.measurement.recorded import recorded
+from tmlattice.observe.response_data import HELD
 from tmlattice.observe.spoilt import without_spoilt
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
@@ -97,20 +100,20 @@ def diagnose(
 
     one = 1 if _readings(measurement) < MANY else None
     measurement, messages = _usable(ring, measurement)
-    given: dict[str, Any] = {"reference": reference, "heldout": heldout}
-    for name, own in given.items():
-        given[name], more = _usable(ring, own)
+    options = Options(
+        ring, judgement=Judgement(false_alarm=false_alarm), effects=effects, assume=assume,
+        reference=reference, heldout=heldout, background=background, known=known,
+        radiation=radiation, missing=missing, seed=seed, progress=progress,
+    )  # fmt: skip
+    for name in ("reference", "heldout"):
+        own, more = _usable(ring, getattr(options, name))
+        options = replace(options, **{name: own})
         messages += [f"the {name}: {sentence}" for sentence in more if sentence not in messages]
-    given |= {"holdout": holdout, "max_effects": max_effects, "background": background,
-              "known": known, "radiation": radiation, "missing": missing}  # fmt: skip
-    options = {name: value for name, value in given.items() if value is not None}
-    options |= {"effects": effects, "false_alarm": false_alarm, "assume": assume, "seed": seed,
-                "progress": progress}  # fmt: skip
     every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
     _each_once(measurement)
     try:
         with threadpool_limits(one, "blas"):
-            found = _diagnosed(ring, measurement, options)
+            found = _diagnosed(measurement, options, holdout, max_effects)
     except np.linalg.LinAlgError as error:  # of data that no model of this ring describes
         raise MeasurementError(
             f"these data cannot be fitted with '{ring.name}' ({error}): run `tmlattice check`, and "
@@ -168,9 +171,19 @@ def _readings(measurement: Any) -> int:
     return max((_largest(one).size for one in some), default=0)
 
 
-def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnosis:
+def _diagnosed(
+    measurement: Any, options: Options, holdout: float | None, most: int | None
+) -> Diagnosis:
+    """The diagnosis by its kind, with what is usual for that where no limit is given."""
+
+    def limited(usual: float, at_most: int, **more: Any) -> Options:
+        return replace(
+            options, holdout=usual if holdout is None else holdout,
+            max_effects=at_most if most is None else most, **more,
+        )  # fmt: skip
+
     measurement = _alone(measurement)
-    if options.get("known") is not None and isinstance(measurement, Measurement):
+    if options.known is not None and isinstance(measurement, Measurement):
         measurement = {kind_of(measurement): measurement}  # with the knowledge of another kind
     if isinstance(measurement, Measurement):
         of = "first turns"
@@ -179,33 +192,34 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
     else:
         of = "several measurements, or those of a stored beam"
     for name in sorted(_OWN - set(_OPTIONS[of])):
-        if options.pop(name, None):
+        if getattr(options, name):
             raise MeasurementError(f"the option '{name}' has no meaning for {of}; leave it out")
-    if isinstance(measurement, Measurement | OrbitResponse) and "reference" in options:
-        before = options["reference"] = _alone(options["reference"])
-        if before is not None and type(before) is not type(measurement):
+    before = options.reference
+    if isinstance(measurement, Measurement | OrbitResponse) and before is not None:
+        before = _alone(before)
+        if type(before) is not type(measurement):
             raise MeasurementError(
                 f"the measurement is {of} and the reference {in_words(before)}: give a reference "
                 "of the same kind"
             )
-    before = options.pop("reference", None)
     if isinstance(measurement, OrbitResponse) and before is None:
+        from tmlattice.diagnosis.families.steps import STEPS
         from tmlattice.diagnosis.response.procedure import diagnose_response
 
-        return diagnose_response(ring, measurement, **options)
+        return diagnose_response(measurement, limited(HELD, len(STEPS)))
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response.before_after import diagnose_change
 
-        if options.pop("missing", False):
+        if options.missing:
             raise MeasurementError("the option 'missing' has no meaning with a reference")
-        return diagnose_change(ring, before, measurement, **options)
+        return diagnose_change(before, measurement, limited(HELD, MAX_CHOSEN))
     from tmlattice.diagnosis.procedure import diagnose_together
 
     if not isinstance(measurement, Mapping):
         measurement = {kind_of(measurement): measurement}
     if before is not None and not isinstance(before, Mapping):
         before = {kind_of(before): before}
-    return diagnose_together(ring, measurement, reference=before, **options)
+    return diagnose_together(measurement, limited(0.33, 8, reference=before))
 
 
 def _alone(measured: Any) -> Any:

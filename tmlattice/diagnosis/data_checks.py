@@ -142,8 +142,8 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
-def _whole(ring: Ring, data: AnyMeasurement, radiation: bool) -> list[Check]:
-    """The checks of data without readings that are rejected."""
+def _whole(ring: Ring, data: AnyMeasurement, radiation: bool, problem: Any = None) -> list[Check]:
+    """The checks of data without readings that are rejected; `problem` has the lines of turns."""
     checks = [_stated(ring, data), *_period(ring, data)]
     if (few := signals.few(ring, data)) is not None:
         return [*checks, few]
@@ -151,7 +151,7 @@ def _whole(ring: Ring, data: AnyMeasurement, radiation: bool) -> list[Check]:
         known = expected_radiation(ring) if radiation else ()
         return [*checks, *_of_first_turns(ring, data, known)]
     data = in_beam_order(data, [monitor.name for monitor in ring.monitors])
-    return [*checks, *_of_compared(ring, data)]
+    return [*checks, *_of_compared(ring, data, problem)]
 
 
 _REPORTED = ("energy", "copied BPMs", "lost beam", GLOBAL, "launches")
@@ -160,19 +160,27 @@ _REPORTED = ("energy", "copied BPMs", "lost beam", GLOBAL, "launches")
 
 def data_checks(
     ring: Ring,
-    data: Measurement | OrbitResponse,
+    data: AnyMeasurement,
     radiation: bool = False,
     reference: Measurement | OrbitResponse | None = None,
+    problem: Any = None,
 ) -> list[str]:
     """The notes on these data, and on a reference, for a diagnosis: without what is rejected
     before, see `check_data`.
+
+    Args:
+        ring: the design.
+        data: of any kind.
+        radiation: see `check_data`.
+        reference: of the same kind.
+        problem: of turns, with their spectral lines; None: they are fitted here.
 
     Raises:
         MeasurementError: a check failed.
     """
 
     both = [
-        Checkup("", tuple(_whole(ring, one, radiation)), {})
+        Checkup("", tuple(_whole(ring, one, radiation, problem)), {})
         for one in (data, reference) if one is not None
     ]  # fmt: skip
     notes = [[check.sentence for check in one.reported if check.name in _REPORTED] for one in both]
@@ -185,17 +193,6 @@ def data_checks(
     both[1].stop(alone.format("the reference"))
     text, reported = notes
     return text + [f"the reference: {sentence}" for sentence in reported if sentence not in text]
-
-
-def raise_if_wrong(ring: Ring, data: AnyMeasurement, problem: Any = None) -> None:
-    """Raise an error if a stored beam's data are wrong as a whole; `problem` has the lines
-    of turns.
-
-    Raises:
-        MeasurementError: what is wrong, and its correction.
-    """
-    ordered = in_beam_order(data, [monitor.name for monitor in ring.monitors])
-    Checkup("", (*_period(ring, data), *_of_compared(ring, ordered, problem)), {}).stop()
 
 
 Some = TypeVar("Some")

@@ -4,22 +4,21 @@ A new kind is a record in `measurement`, a problem in `observe`, and a line in `
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.model import Model
+from tmlattice.beam.model import Model, Paths
 from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
-from tmlattice.diagnosis.data_checks import corrected_data, data_checks, raise_if_wrong
-from tmlattice.diagnosis.prepare import batch, noise_of, prepare
-from tmlattice.effects import Hypothesis
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks
+from tmlattice.diagnosis.options import Options
+from tmlattice.diagnosis.prepare import Part, batch, noise_of, prepare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
-from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Problem
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
@@ -32,9 +31,9 @@ from tmlattice.measurement import (
     TuneReading,
     TurnByTurn,
 )
-from tmlattice.observe.data import of_measurement
+from tmlattice.observe.data import Data, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
-from tmlattice.observe.noise import scatter
+from tmlattice.observe.noise import estimate, scatter
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import HELD, ResponseData, response_data, split_columns
@@ -52,66 +51,7 @@ KICK, ENERGY_ORBIT = 1e-4, 1.3e-3
 """Kick of each corrector, rad; orbit change by the RF's step, m rms."""
 
 
-@dataclass(frozen=True)
-class PartOptions:
-    """Options of the diagnosis that a part needs.
-
-    Attributes:
-        ring: the design.
-        places: number of places of each effect, for the prior.
-        judgement: thresholds.
-        holdout: share of shots, or of correctors, that the fit does not see.
-        assume: what was written down wrongly everywhere.
-        seed: of the split.
-        effects: names of those that may be the cause; None: all usual ones.
-        radiation: the model of first turns radiates as expected.
-        reference: of first turns alone: shots from before, which share the errors of the machine.
-        heldout: of first turns alone: the shots that validate, instead of a share.
-    """
-
-    ring: Ring
-    places: Mapping[str, float]
-    judgement: Judgement
-    holdout: float = 0.0
-    assume: Sequence[str] = ()
-    seed: int = 0
-    effects: Sequence[str] | None = None
-    radiation: bool = False
-    reference: Measurement | None = None
-    heldout: Measurement | None = None
-
-
-@dataclass(frozen=True)
-class Part:
-    """One measurement of several.
-
-    Attributes:
-        label: what the user calls it.
-        kind: as its folder has it.
-        problem: what is fitted.
-        heldout: the validation set; None where nothing is held out.
-        estimated: whether its noise comes from the data.
-        dead: monitors without a signal (1) or with a frozen one (2), (index, which).
-        messages: about the data.
-        hypotheses: what its readings can determine; None: what the problem sees.
-        start: nuisances to start at; None: the problem's own first guess.
-        shots: numbers of those of the fit, those of a reference first (None), and of those that
-            are held out.
-    """
-
-    label: str
-    kind: str
-    problem: Problem = field(repr=False)
-    heldout: Problem | None = field(default=None, repr=False)
-    estimated: bool = False
-    dead: tuple[tuple[int, float], ...] = ()
-    messages: tuple[str, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] | None = None
-    start: Array | None = field(default=None, repr=False)
-    shots: tuple[tuple[int | None, ...], tuple[int, ...]] = ((), ())
-
-
-def part_of(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
+def part_of(label: str, measured: AnyMeasurement, options: Options) -> Part:
     """Return a measurement as a part of a diagnosis.
 
     Raises:
@@ -123,7 +63,7 @@ def part_of(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
     return KINDS[name].part(label, name, measured, options)
 
 
-def stacked(parts: Sequence[Part], before: Sequence[Part], options: PartOptions) -> CombinedProblem:
+def stacked(parts: Sequence[Part], before: Sequence[Part], options: Options) -> CombinedProblem:
     """Measurements with those of a reference as one problem; stored beams of one machine share its
     models."""
     cache = ModelCache()
@@ -151,7 +91,7 @@ def kind_of(measured: AnyMeasurement) -> str:
 
 
 # --- the kinds ----
-def _first_turns(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+def _first_turns(label: str, kind: str, measured: Any, options: Options) -> Part:
     ring = options.ring
     before, held = (
         corrected_data(ring, own, options.assume) for own in (options.reference, options.heldout)
@@ -164,25 +104,41 @@ def _first_turns(label: str, kind: str, measured: Any, options: PartOptions) -> 
         if held is None and not options.places:
             messages.append("one shot was measured, so none is held out")
     chosen = (options.radiation, options.effects, options.judgement)
-    ready = prepare(ring, measured, before, *chosen)
-    estimated = ready.estimated
+    both = [prepare(ring, own, *chosen) for own in (measured, before) if own is not None]
+    estimated = any(own.estimated for own in both)
     if before is not None and estimated:  # the same electronics: from all shots
-        noise = scatter(ready.problem.data, ready.before.point.view)
-        if np.isfinite(noise).all():
-            measured, before = (_with_noise(own, noise) for own in (measured, before))
-            ready = prepare(ring, measured, before, *chosen)
+        ways = [_data_and_paths(own) for own in both]
+        noise = scatter(ways)
+        noise = noise if np.isfinite(noise).all() else estimate(ways)
+        both = [prepare(ring, _with_noise(own, noise), *chosen) for own in (measured, before)]
+    ready, *earlier = both
+    turns = ready.problem
+    assert isinstance(turns, FirstTurns)
     other = None
     if held is not None:
-        data = of_measurement(ring, held).with_sigma(np.array(noise_of(ready.problem.data)))
-        known = ready.problem.model.assembly.known
-        model = Model(ring, data.settings, data.turns, known, active=data.active)
+        data = of_measurement(ring, held).with_sigma(np.array(noise_of(turns.data)))
+        known = turns.model.assembly.known
+        model = Model(ring, data.settings, data.turns, known)
         other = FirstTurns(model=model, data=data, places=options.places)
-    earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
-    return Part(
-        label, kind, ready.problem, other, estimated, ready.dead, (*messages, *ready.messages),
-        ready.hypotheses, ready.before.nuisances,
-        ((*earlier, *measured.shots), () if held is None else tuple(held.shots)),
+    for own in earlier:
+        more = [one for one in own.messages if one not in ready.messages]
+        more += [
+            f"BPM '{ring.monitors[m].name}' has no signal or a frozen one, and is not used"
+            for m, _ in own.dead if m not in dict(ready.dead)
+        ]  # fmt: skip
+        messages += [f"of the reference: {one}" for one in more]
+    return replace(
+        ready, label=label, heldout=other, estimated=estimated, reference=next(iter(earlier), None),
+        messages=(*messages, *ready.messages),
+        shots=(tuple(measured.shots), () if held is None else tuple(held.shots)),
     )  # fmt: skip
+
+
+def _data_and_paths(part: Part) -> tuple[Data, Paths]:
+    """The readings of first turns, and the trajectories of their fitted launches."""
+    assert isinstance(part.problem, FirstTurns)
+    assert part.start is not None
+    return part.problem.data, part.problem.at((), part.start).view
 
 
 def _with_noise(measured: Measurement, noise: Array) -> Measurement:
@@ -192,7 +148,7 @@ def _with_noise(measured: Measurement, noise: Array) -> Measurement:
     return replace(measured, noise=np.where(np.isfinite(stated), stated, noise))
 
 
-def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+def _response(label: str, kind: str, measured: Any, options: Options) -> Part:
     messages = tuple(data_checks(options.ring, measured))
     data = response_data(options.ring, measured)
     whole = _problem(data, options)
@@ -208,7 +164,7 @@ def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Par
     return Part(label, kind, fitted, judges, messages=messages)
 
 
-def _problem(data: ResponseData, options: PartOptions) -> Response:
+def _problem(data: ResponseData, options: Options) -> Response:
     """All readings of a response as a problem."""
     return Response(
         base=Predicted(data, Errors.none(data)).bend(), used=np.isfinite(data.orbits),
@@ -218,10 +174,10 @@ def _problem(data: ResponseData, options: PartOptions) -> Response:
 
 def _of_stored(
     make: Callable[..., Stored], shots: bool = False
-) -> Callable[[str, str, Any, PartOptions], Part]:
+) -> Callable[[str, str, Any, Options], Part]:
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
-    def made(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+    def made(label: str, kind: str, measured: Any, options: Options) -> Part:
         held = None
         ids = list(measured.shots) if shots else []
         count = round(options.holdout * len(ids))
@@ -231,10 +187,10 @@ def _of_stored(
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
         problem = make(options.ring, measured, options.places)
-        raise_if_wrong(options.ring, measured, problem)
-        messages = problem.warnings if isinstance(problem, ManyTurns) else ()
+        messages = data_checks(options.ring, measured, problem=problem)
+        messages += problem.warnings if isinstance(problem, ManyTurns) else ()
         judges = held and make(options.ring, held, options.places)
-        return Part(label, kind, problem, judges, messages=messages)
+        return Part(label, kind, problem, judges, messages=tuple(messages))
 
     return made
 
@@ -245,15 +201,15 @@ def _no_orbit(ring: Ring) -> tuple[tuple[str, ...], Array]:
     return names, np.zeros((len(names), 2))
 
 
-def _propose_orbit(ring: Ring, options: PartOptions) -> Problem:
+def _propose_orbit(ring: Ring, options: Options) -> Problem:
     names, nothing = _no_orbit(ring)
     orbit = ClosedOrbit(orbit=nothing[None], monitors=names, noise=nothing + NOISE)
     return closed_orbits(ring, orbit, options.places)
 
 
-def _propose_dispersion(ring: Ring, options: PartOptions) -> Problem:
+def _propose_dispersion(ring: Ring, options: Options) -> Problem:
     names, nothing = _no_orbit(ring)
-    model, rf = ResponseModel(ring), rf_of(ring)
+    model, rf = ResponseModel.of(ring), rf_of(ring)
     size = rms(model.rf_response()[:, 0])
     if not size:
         raise TmlatticeError("no dispersion")
@@ -264,7 +220,7 @@ def _propose_dispersion(ring: Ring, options: PartOptions) -> Problem:
     return dispersion(ring, proposed, options.places)
 
 
-def _propose_tunes(ring: Ring, options: PartOptions) -> Problem:
+def _propose_tunes(ring: Ring, options: Options) -> Problem:
     two = np.ones((1, 2))
     reading = TuneReading(
         tune=0.25 * two, tune_error=TUNE * two, chromaticity=two,
@@ -273,9 +229,9 @@ def _propose_tunes(ring: Ring, options: PartOptions) -> Problem:
     return tune_readings(ring, reading, options.places)
 
 
-def _propose_turns(ring: Ring, options: PartOptions) -> Problem:
+def _propose_turns(ring: Ring, options: Options) -> Problem:
     names, nothing = _no_orbit(ring)
-    beam = StoredBeam(ResponseModel(ring))
+    beam = StoredBeam(ResponseModel.of(ring))
     lines = AMPLITUDE * beam.modes / np.abs(beam.modes).max(axis=(0, 1))
     noise = np.full(lines.shape, TURN_NOISE * np.sqrt(2 / TURNS))
     found = Lines(
@@ -286,9 +242,9 @@ def _propose_turns(ring: Ring, options: PartOptions) -> Problem:
     return many_turns(ring, kicked, options.places, found)
 
 
-def _propose_response(ring: Ring, options: PartOptions) -> Problem:
+def _propose_response(ring: Ring, options: Options) -> Problem:
     names, nothing = _no_orbit(ring)
-    columns = ResponseModel(ring).columns(None)
+    columns = ResponseModel.of(ring).columns(None)
     count = len(columns.names)
     if not count:
         raise TmlatticeError("no corrector")
@@ -316,10 +272,10 @@ class Kind:
     """
 
     record: type
-    part: Callable[[str, str, Any, PartOptions], Part]
+    part: Callable[[str, str, Any, Options], Part]
     quantities: tuple[str, ...] = ()
     words: str = ""
-    proposal: Callable[[Ring, PartOptions], Problem] | None = None
+    proposal: Callable[[Ring, Options], Problem] | None = None
     per_measurement: float = 0.0
     per_corrector: float = 0.0
 

@@ -22,7 +22,6 @@ from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import Suspect
-from tmlattice.diagnosis.views import PartView, StoredView
 from tmlattice.effects import Cause, apply, changes_beam
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.inference.validation import Gap, Misfit
@@ -109,7 +108,6 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         held["readings"],
         held["lost"],
     )  # fmt: skip
-    parts = [{**row, "monitors": [], "left": np.zeros((2, 0))} for row in d.get("measurements", ())]
     made: Diagnosis = cls(
         findings=decoded(tuple[Finding, ...], findings),
         fit_before=decoded(Misfit, gap["fit"]["before"]),
@@ -122,12 +120,9 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         corrected=apply(ring, [cause for cause in causes if changes_beam(cause.effect)]),
         causes=causes,
         errors=tuple(decoded(float, row["amount_sigma"]) for row in d["errors"]),
-        view=StoredView(
-            d["kind"],
-            decoded(tuple[PartView, ...], parts),
-            tuple(d["assessment"]["measured"]),
-            held.get("correctors"),
-        ),
+        view=None,
+        measured=tuple(d["assessment"]["measured"]),
+        correctors_held_out=held.get("correctors"),
         compared=decoded(tuple[Block, ...], d["assessment"]["blocks"]),
         supports=decoded(tuple[Support, ...], d["errors"]),
         **{

@@ -19,7 +19,8 @@ from tmlattice.arrays import TINY, Array
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.diagnosis.findings import credible
-from tmlattice.diagnosis.kinds import KINDS, PartOptions
+from tmlattice.diagnosis.kinds import KINDS
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.result import NextMeasurement
 from tmlattice.effects import Cause, Settings, find
@@ -77,16 +78,15 @@ def next_measurement(
     count = len(launches)
     shape = (count, data.turns * len(model.at), 2)
     sigma = np.nanmedian(data.sigma.reshape(-1, 2), axis=0)
-    prior = data.launch_sigma[data.active][:1]
+    prior = data.launch_sigma[:1]
     shots = Data(
         readings=np.zeros(shape),
-        valid=np.broadcast_to(data.valid[data.active].any(axis=0), shape).copy(),
+        valid=np.broadcast_to(data.valid.any(axis=0), shape).copy(),
         sigma=np.broadcast_to(sigma, shape).copy(),
         launches=launches,
         launch_sigma=np.repeat(prior, count, axis=0),
         settings=tuple(settings),
         turns=data.turns,
-        active=np.ones(count, dtype=bool),
     )
     problem = FirstTurns(model=model, data=shots, places={})
     points = [problem.at(own.fit.causes, launches) for own in (first, second)]
@@ -136,7 +136,7 @@ def _candidates(
     ring: Ring, data: Data, rivals: Sequence[Alternative], seed: int
 ) -> tuple[Array, list[Settings]]:
     """Candidate launches [shot, 5] and settings; no launch starts on the axis."""
-    measured = data.launches[data.active]
+    measured = data.launches
     launches = [row for row in measured[:2] if np.any(row[:4])]
     try:
         modes = one_turn_optics(Chain.from_ring(ring)).modes
@@ -188,7 +188,7 @@ def next_kind(
     ring: Ring,
     explanation: Explanation,
     taken: Sequence[str],
-    options: PartOptions,
+    options: Options,
     fixed: tuple[Cause, ...],
 ) -> NextMeasurement | None:
     """Recommend a kind of measurement that was not taken; None where nothing is ambiguous or no

@@ -4,11 +4,11 @@ BPMs without a signal are rejected, and the noise is estimated where none is sta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tmlattice.arrays import AT_ONCE, Array, Flags, rms
+from tmlattice.arrays import AT_ONCE, Array, rms
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.effects import (
@@ -23,11 +23,12 @@ from tmlattice.effects import (
 from tmlattice.errors import BeamLostError, EffectError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ITERATIONS, Fit, fit
+from tmlattice.inference.problem import Problem
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
-from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.observe.data import Data, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import estimate
 from tmlattice.observe.sections import KEPT
@@ -54,35 +55,44 @@ magnets, 280 in fifteen hundred."""
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """A measurement ready for the search.
+class Part:
+    """One measurement of several.
 
     Attributes:
-        problem: launches and readings, no distributed errors.
-        before: launches alone.
-        hypotheses: what may be the cause.
+        label: what the user calls it.
+        kind: as its folder has it.
+        problem: what is fitted.
+        heldout: the validation set; None where nothing is held out.
+        estimated: whether its noise comes from the data.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
-        estimated: whether the noise comes from the data.
         messages: about the data.
+        hypotheses: what its readings can determine; None: what the problem sees.
+        start: nuisances to start at; None: the problem's own first guess.
+        shots: numbers of those of the fit, and of those that are held out.
+        reference: the earlier measurement of first turns, if there is one.
     """
 
-    problem: FirstTurns
-    before: Fit
-    hypotheses: tuple[Hypothesis, ...]
-    dead: tuple[tuple[int, float], ...]
-    estimated: bool
-    messages: tuple[str, ...]
+    label: str
+    kind: str
+    problem: Problem = field(repr=False)
+    heldout: Problem | None = field(default=None, repr=False)
+    estimated: bool = False
+    dead: tuple[tuple[int, float], ...] = ()
+    messages: tuple[str, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] | None = None
+    start: Array | None = field(default=None, repr=False)
+    shots: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    reference: "Part | None" = None
 
 
 def prepare(
     ring: Ring,
     measurement: Measurement,
-    reference: Measurement | None,
     radiation: bool,
     effects: Sequence[str] | None,
     judgement: Judgement,
-) -> Prepared:
-    """Return data, model and launches.
+) -> Part:
+    """Return first turns with data, model and launches, without a validation set.
 
     Raises:
         MeasurementError: data that cannot be used.
@@ -92,11 +102,9 @@ def prepare(
     """
     known = tuple(expected_radiation(ring)) if radiation else ()
     data = of_measurement(ring, measurement)
-    if reference is not None:
-        data = joined(of_measurement(ring, reference, reference=True), data)
     chosen = chosen_effects(ring, effects, data.launch_sigma)
     places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
-    model = Model(ring, data.settings, data.turns, known, active=data.active)
+    model = Model(ring, data.settings, data.turns, known)
     listed = {name.casefold() for name in measurement.monitors}
     dead, data, messages = _dead_monitors(model, data, listed, judgement)
     rough = data.with_sigma(np.array([ROUGH, ROUGH]))
@@ -110,7 +118,10 @@ def prepare(
     problem = replace(problem, data=data)
     before = _on_its_way(problem, start.nuisances, ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
-    return Prepared(problem, before, hypotheses, dead, estimated, messages)
+    return Part(
+        "first turns", "trajectory", problem, None, estimated, dead, messages, hypotheses,
+        before.nuisances,
+    )  # fmt: skip
 
 
 def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurement:
@@ -231,7 +242,7 @@ def _with_noise(data: Data, start: Fit) -> tuple[Data, bool]:
         raise MeasurementError("a BPM's noise is zero or negative; leave it out if unknown")
     estimated = bool(missing.any())
     if estimated:
-        found = estimate(data, start.point.view)
+        found = estimate([(data, start.point.view)])
         if not np.isfinite(found).any():
             raise MeasurementError(
                 "the noise is not given and the readings are too few to estimate it; give the "
@@ -257,16 +268,6 @@ def _above_the_floor(data: Data) -> tuple[Data, tuple[str, ...]]:
         f"for such an orbit: {1e6 * floor:.2g} µm is taken"
     )
     return replace(data, sigma=np.maximum(data.sigma, floor)), (message,)
-
-
-def same_monitors(other: Data, data: Data, dropped: Flags) -> Data:
-    """Held-out readings of the BPMs that the fit kept, which dropped [shot, reading, 2]."""
-    lost = dropped[data.active].all(axis=0)
-    never = np.asarray(lost | ~data.valid[data.active].any(axis=0))
-    readings = min(len(never), other.valid.shape[1])
-    outliers = np.zeros(other.valid.shape, dtype=bool)
-    outliers[:, :readings] = never[None, :readings]
-    return other.without(outliers)
 
 
 def chosen_effects(ring: Ring, effects: Sequence[str] | None, launch_sigma: Array) -> list[str]:

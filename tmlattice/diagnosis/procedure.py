@@ -1,15 +1,14 @@
 """The diagnosis of first turns, of what a stored beam shows, and of several measurements together.
 
->>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
+>>> diagnose(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
 
 Rows are stacked; causes are shared, nuisances are each measurement's own (see `selection`
 for the steps). A reference of each kind has the earlier errors.
 """
 
 import logging
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,15 +23,15 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.kinds import Part, PartOptions, kind_of, part_of, stacked
+from tmlattice.diagnosis.kinds import KINDS, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_measurement import leading, next_kind, next_measurement
-from tmlattice.diagnosis.prepare import noise_of
+from tmlattice.diagnosis.options import Options
+from tmlattice.diagnosis.prepare import Part, noise_of
 from tmlattice.diagnosis.result import MOST, Diagnosis, Finding, NextMeasurement
 from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
     Stage,
     held_out,
-    held_out_shots,
     misfit_of,
     seen_by,
     stages_of,
@@ -40,7 +39,7 @@ from tmlattice.diagnosis.stages import (
 )
 from tmlattice.diagnosis.support import correlations_of
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.diagnosis.views import JointView, TrajectoryView
+from tmlattice.diagnosis.views import TrajectoryView
 from tmlattice.effects import (
     Cause,
     Effect,
@@ -54,47 +53,26 @@ from tmlattice.effects import (
 )
 from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
-from tmlattice.inference.distributed import DistributedErrors, FittedErrors
-from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.distributed import FittedErrors
 from tmlattice.inference.newton import Outcome
 from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.inference.validation import Misfit
 from tmlattice.lattice import Ring
-from tmlattice.measurement import AnyMeasurement, Measurement
+from tmlattice.measurement import AnyMeasurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
 from tmlattice.speaks import listed, micrometres
-from tmlattice.version import __version__
 
 log = logging.getLogger(__name__)
 
 
-def diagnose_together(
-    ring: Ring,
-    measured: Mapping[str, AnyMeasurement],
-    *,
-    reference: Mapping[str, Any] | None = None,
-    background: str | Mapping[str, float | None] | None = None,
-    known: DistributedErrors | None = None,
-    holdout: float = 0.33,
-    heldout: Measurement | None = None,
-    effects: Sequence[str] | None = None,
-    max_effects: int = 8,
-    radiation: bool = False,
-    false_alarm: float = DEFAULT.false_alarm,
-    assume: Sequence[str] = (),
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda _: None,
-) -> Diagnosis:
+def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) -> Diagnosis:
     """Locate the gap between a ring and its measurements, identify its causes, and validate them.
 
     Args:
-        ring: the design.
-        measured, reference: by the names that the result calls them.
-        heldout, radiation: of first turns alone.
-        background, known, holdout, effects, max_effects, false_alarm, assume, seed, progress: as of
-            `diagnose`.
+        measured: by the names that the result calls them.
+        given: with a reference by the names that the result calls it.
 
     Raises:
         MeasurementError: data that cannot be used; the message names them.
@@ -102,25 +80,22 @@ def diagnose_together(
         UnknownNameError: a monitor or an effect that does not exist.
         UnstableRingError: the design has no stored beam.
     """
-    begun = time.perf_counter()
-    judgement = Judgement(false_alarm=false_alarm)
-    options = PartOptions(ring, {}, judgement, holdout, assume, seed)
-    progress("data")
+    ring, effects, known, reference = given.ring, given.effects, given.known, given.reference
+    given.progress("data")
     kinds = [kind_of(one) for one in measured.values()]
     if kinds == ["trajectory"] and known is None:  # with launches of its own, all can be shared
         (label, one), *_ = measured.items()
         first = next(iter((reference or {}).values()), None)
-        whole = replace(
-            options, effects=effects, radiation=radiation, reference=first, heldout=heldout
-        )
-        parts, before = [part_of(label, one, whole)], list[Part]()
+        options = replace(given, reference=first)
+        parts = [part_of(label, one, options)]
+        before = [one.reference for one in parts if one.reference is not None]
         hypotheses = list(parts[0].hypotheses or ())
         chosen = list(parts[0].problem.places)
-        options = replace(whole, places=parts[0].problem.places)
+        options = replace(options, places=parts[0].problem.places)
     else:
         chosen = _chosen(ring, effects, "turn_by_turn" in kinds)
         places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
-        options = replace(options, places=places)
+        options = replace(given, places=places, reference=None, effects=None)
         parts = [
             with_silent(ring, _named(label, one, options), one) for label, one in measured.items()
         ]
@@ -132,10 +107,11 @@ def diagnose_together(
         fixed=() if known is None else known.causes,
     )  # fmt: skip
     search = Search(
-        problem, hypotheses, max_effects, seed=seed, progress=progress,
+        problem, hypotheses, given.max_effects, seed=given.seed, progress=given.progress,
         unnamed=all(part.kind != "orbit_response" for part in parts),
     )  # fmt: skip
     usual = background_rms("all")
+    background = given.background
     if isinstance(background, str):
         background = {background: None}
     sizes = usual if background is None else background_rms(background)
@@ -145,7 +121,7 @@ def diagnose_together(
     if problem.alone:
         selected = select(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
     else:
-        first, _ = problem.reference(problem.first)
+        first = problem.reference
         earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
         selected = select_changes(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
     small = selected.distributed
@@ -154,23 +130,12 @@ def diagnose_together(
         problem = small.plain
         own = zip(parts, problem.parts, strict=True)
         parts = [replace(part, problem=learnt) for part, learnt in own]
-    progress("report")
-    return _report(
-        ring, parts, problem, selected.explanation, small, options,
-        {
-            "seconds": time.perf_counter() - begun, "seed": seed,
-            "options": {
-                "reference": reference is not None,
-                "background": None if background is None else dict(background),
-                "holdout": holdout, "effects": None if effects is None else list(effects),
-                "max_effects": max_effects, "false_alarm": false_alarm, "radiation": radiation,
-                **({"assume": list(assume)} if assume else {}),
-            },
-        },
-    )  # fmt: skip
+    given.progress("report")
+    made = given.provenance(background=None if background is None else dict(background))
+    return _report(parts, problem, selected.explanation, small, options, made)
 
 
-def _named(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
+def _named(label: str, measured: AnyMeasurement, options: Options) -> Part:
     try:
         return part_of(label, measured, options)
     except MeasurementError as error:
@@ -200,17 +165,17 @@ def _of_launches(effect: Effect) -> bool:
 
 # --- results ----
 def _report(
-    ring: Ring,
     parts: Sequence[Part],
     problem: CombinedProblem,
     found: Explanation,
     small: FittedErrors | None,
-    options: PartOptions,
-    made: Mapping[str, Any],
+    options: Options,
+    provenance: dict[str, Any],
     refuted: str = "",
 ) -> Diagnosis:
     """The diagnosis; without its causes if they are refuted, for this reason."""
-    judgement, given = options.judgement, (ring, parts, problem, found, small, options, made)
+    given = (parts, problem, found, small, options, provenance)
+    ring, judgement = options.ring, options.judgement
     found = finished(found)
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}  # by their place in the ring
     aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
@@ -242,19 +207,16 @@ def _report(
     since = 0 if small is None else max(len(stages) - 2, 0)
     turns = parts[0] if parts[0].hypotheses is not None and len(parts) == 1 else None
     rejected: tuple[dict[str, Any], ...] = ()
+    heldout = held_out(parts, kept, found, small, stages, since)
     if turns is None:
-        heldout = held_out(
-            parts, problem.fixed, stages, {ring.monitors[m].name for m in aside}, since
-        )
         # errors of held-out readings do not include undetermined distributed errors
         compared = compared_of(fitted, heldout if small is None else None)
         stated = tuple(f"{part.label}: {one}" for part in parts for one in part.messages)
         notes = list(outlier_messages(parts, problem, found))
     else:
-        heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
         stated = turns.messages
-        rejected = rejected_readings(turns, found)
+        rejected = rejected_readings(turns, problem, found)
         notes = about_rejected(rejected)
         if turns.estimated:
             both = zip(_noise(parts), "xy", strict=True)
@@ -263,7 +225,8 @@ def _report(
         notes += about_launches(turns, findings)
     if causes and stages[-1].share < 1:
         return _report(*given, refuted="no beam is stored with them and the distributed errors")
-    if causes and heldout is not None and heldout.refutes:
+    # shots alone: parts of other validation sets do not see each cause
+    if causes and turns is not None and heldout is not None and heldout.refutes:
         return _report(*given, refuted="with them the gap of the held-out readings stays")
     warnings = [*stated, *notes, *messages]
     if (share := stages[-1].share) < 1:
@@ -271,12 +234,13 @@ def _report(
             "no beam is stored with all of the estimated distributed errors: the residuals are for "
             f"{share:.4g} of the last step to them"
         )
-    view: JointView | TrajectoryView = JointView(found, views)
+    view: Explanation | TrajectoryView = found
     if turns is not None:
-        (own,) = kept.parts
+        own = kept.parts[0]
         assert isinstance(own, FirstTurns)
         before, after = (stages[i].point.view[0].view.readings for i in (0, -1))
-        view = TrajectoryView(found, own, before, after, found.dropped.reshape(own.valid.shape))
+        dropped = found.dropped[: own.valid.size].reshape(own.valid.shape)
+        view = TrajectoryView(found, own, before, after, dropped)
 
     def misfit(stage: Stage) -> Misfit:  # without the reference
         return misfit_of([*zip(kept.parts[: len(parts)], stage.point.view, strict=False)])
@@ -284,7 +248,9 @@ def _report(
     corrected = apply(ring, causes)
     covariance = result.covariance[: len(causes), : len(causes)]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    kinds = [part.kind for part in parts]
     return Diagnosis(
+        kind=kinds[0] if len(kinds) == 1 else "together",
         verdict=verdict,
         findings=tuple(
             replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one))
@@ -306,14 +272,14 @@ def _report(
             judgement,
         ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected)},
-        next=_next(ring, found, parts, options, problem.fixed),
+        next=_next(found, parts, options, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
         outliers=rejected,
         noise=_noise(parts),
         noise_estimated=estimated,
-        provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
+        provenance=provenance,
         ring=ring,
         corrected=corrected,
         causes=causes,
@@ -321,18 +287,16 @@ def _report(
         priors={} if small is None else dict(small.sizes),
         prior_errors={} if small is None else dict(small.errors),
         view=view,
+        measured=tuple(sorted({own for kind in kinds for own in KINDS[kind].quantities})),
+        parts=views if turns is None else (),
     )
 
 
 def _next(
-    ring: Ring,
-    found: Explanation,
-    parts: Sequence[Part],
-    options: PartOptions,
-    fixed: tuple[Cause, ...],
+    found: Explanation, parts: Sequence[Part], options: Options, fixed: tuple[Cause, ...]
 ) -> NextMeasurement | None:
     """The recommended next measurement: of first turns one more shot, else another kind."""
-    one = parts[0].problem
+    ring, one = options.ring, parts[0].problem
     if len(parts) > 1 or not isinstance(one, FirstTurns):
         return next_kind(ring, found, [part.kind for part in parts], options, fixed)
     pair = leading(ring, found, options.judgement.mass)
@@ -391,17 +355,21 @@ def outlier_messages(
 
 
 # --- of first turns -------------------------------------------------------------------------------
-def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], ...]:
+def rejected_readings(
+    part: Part, problem: CombinedProblem, found: Explanation
+) -> tuple[dict[str, Any], ...]:
     """Single readings that the search rejected, {"shot", "turn", "monitor", "plane"}; the shot of a
     reference is None."""
     rows: list[dict[str, Any]] = []
-    names = part.problem.monitors
+    names, own = part.problem.monitors, problem.parts[0].valid
     for (flat,) in found.outliers:
-        shot, reading, plane = np.unravel_index(flat, part.problem.valid.shape)
+        of_reference = flat >= own.size
+        there, at = (problem.parts[1].valid, flat - own.size) if of_reference else (own, flat)
+        shot, reading, plane = np.unravel_index(at, there.shape)
         turn, monitor = divmod(int(reading), len(names))
         rows.append({
-            "shot": part.shots[0][shot], "turn": turn, "monitor": names[monitor],
-            "plane": "xy"[plane],
+            "shot": None if of_reference else part.shots[0][shot], "turn": turn,
+            "monitor": names[monitor], "plane": "xy"[plane],
         })  # fmt: skip
     return tuple(rows)
 
@@ -416,7 +384,7 @@ def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:
             f"a localised error may begin upstream in {unread}, which sextupoles couple into "
             f"{other}"
         )
-    if data.active.sum() == 1 and findings:
+    if data.shots == 1 and findings:
         notes.append(
             "one trajectory gives one kick at each place: any single multipole "
             "explains it; two or more launches identify the effect"

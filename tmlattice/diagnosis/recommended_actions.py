@@ -2,7 +2,7 @@
 
 A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses with one
 action: set the gradient of that magnet. The catalogue lists which effects share an action, and in
-which amount (`Effect.stands_for`). The pieces of a magnet are one.
+which amount (`Effect.corrected_as`). The pieces of a magnet are one.
 
 >>> action = recommended_actions(ring, alternatives, probability)[0]
 >>> action.action, action.amount, action.probability

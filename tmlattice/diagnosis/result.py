@@ -6,23 +6,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from tmlattice.arrays import Array, rms
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
-from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
-from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, encoded, named, of, record_of
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, named, of, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
-from tmlattice.diagnosis.views import (
-    JointView,
-    PartView,
-    ResponseView,
-    StoredView,
-    TrajectoryView,
-)
+from tmlattice.diagnosis.views import PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, Settings, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.alternatives import Detection
@@ -139,7 +130,7 @@ class Finding(Speaks):
 
     @property
     def verdict(self) -> str:
-        """Of this finding alone: `equivalent` where places or actions differ."""
+        """Of this finding alone: `ambiguous` where recommended actions differ."""
         if self.effect is None:
             return "localised"
         return "identified" if len(self.recommended_actions) == 1 else "ambiguous"
@@ -205,6 +196,7 @@ class Diagnosis(Speaks):
     """The result of a diagnosis. See `as_json` for the file format.
 
     Attributes:
+        kind: of measurement, as its folder has it; "together" of several.
         verdict: the least certain of the findings', see `VERDICTS`.
         findings: by falling statistic.
         fit_before, fit_after: misfit of the readings of the fit.
@@ -224,7 +216,12 @@ class Diagnosis(Speaks):
             in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
-        view: what figures need, with what was measured.
+        view: what figures need: of a stored beam's measurements, or of several together, the
+            search; None after loading.
+        measured: quantities of the stored beam that were measured.
+        parts: the measurements, where there are several or a stored beam's.
+        correctors_held_out: how many correctors of an orbit response are the validation set; None
+            of another kind.
         steps: scores of the design, of the hierarchical fit, and of those given faults.
         families: of a hierarchical fit, the scores with the decision on each family reversed.
         bad_monitors: names of the rejected BPMs.
@@ -248,6 +245,7 @@ class Diagnosis(Speaks):
             because their priors are log-uniform.
     """
 
+    kind: str
     verdict: str
     findings: tuple[Finding, ...]
     fit_before: Misfit = field(metadata=HIDDEN)
@@ -266,9 +264,10 @@ class Diagnosis(Speaks):
     corrected: Ring = field(repr=False, metadata=HIDDEN)
     causes: tuple[Cause, ...] = field(metadata=HIDDEN)
     errors: tuple[float, ...] = field(metadata=HIDDEN)
-    view: TrajectoryView | ResponseView | JointView | StoredView = field(
-        repr=False, metadata=HIDDEN
-    )
+    view: TrajectoryView | ResponseView | Explanation | None = field(repr=False, metadata=HIDDEN)
+    measured: tuple[str, ...] = field(metadata=HIDDEN)
+    parts: tuple[PartView, ...] = field(default=(), metadata=OPTIONAL | named("measurements"))
+    correctors_held_out: int | None = field(default=None, metadata=HIDDEN)
     outliers: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
     families: "tuple[Step, ...]" = ()
@@ -344,30 +343,10 @@ class Diagnosis(Speaks):
         )
 
     @property
-    def measured(self) -> tuple[str, ...]:
-        """Quantities of the stored beam that were measured."""
-        if isinstance(self.view, StoredView):
-            return self.view.measured
-        kinds = {part.kind for part in self.parts} or {self.kind}
-        found = {quantity for kind in kinds for quantity in KINDS[kind].quantities}
-        if isinstance(self.view, ResponseView) and np.isfinite(self.view.data[-1]).any():
-            found.add("dispersion")
-        return tuple(sorted(found))
-
-    @property
     def supported(self) -> "tuple[tuple[Cause, float, Support], ...]":
         """The causes, with their errors and how much of each comes from the data."""
         supports = self.supports or (FREE,) * len(self.causes)
         return tuple(zip(self.causes, self.errors, supports, strict=True))
-
-    @property
-    def kind(self) -> str:
-        """The kind of measurement, as its folder has it; "together" of several."""
-        if isinstance(self.view, StoredView):
-            return self.view.kind
-        if isinstance(self.view, JointView):
-            return self.view.parts[0].kind if len(self.view.parts) == 1 else "together"
-        return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
 
     @property
     def by_families(self) -> bool:
@@ -377,14 +356,7 @@ class Diagnosis(Speaks):
     @property
     def stored(self) -> bool:
         """Whether it is of `Diagnosis.load`, without readings, scan and covariance."""
-        return isinstance(self.view, StoredView)
-
-    @property
-    def correctors_held_out(self) -> int | None:
-        """How many correctors of an orbit response are the validation set."""
-        if isinstance(self.view, StoredView):
-            return self.view.correctors
-        return int(self.view.held.sum()) if isinstance(self.view, ResponseView) else None
+        return self.view is None
 
     @property
     def since_reference(self) -> bool:
@@ -400,11 +372,6 @@ class Diagnosis(Speaks):
     def has_reference(self) -> bool:
         """Whether a reference was given."""
         return bool(self.provenance["options"].get("reference"))
-
-    @property
-    def parts(self) -> tuple[PartView, ...]:
-        """The measurements, where there are several or a stored beam's."""
-        return self.view.parts if isinstance(self.view, JointView | StoredView) else ()
 
     @property
     def trajectories(self) -> TrajectoryView:
@@ -431,9 +398,11 @@ class Diagnosis(Speaks):
             MeasurementError: it was loaded from a file, which does not hold it.
         """
         self._read()
-        if not isinstance(self.view, TrajectoryView | JointView):
+        if isinstance(self.view, TrajectoryView):
+            return self.view.explanation
+        if not isinstance(self.view, Explanation):
             raise TypeError("an orbit response has a hierarchical fit: there was no search")
-        return self.view.explanation
+        return self.view
 
     def _read(self) -> None:
         if self.stored:
@@ -541,7 +510,6 @@ class Diagnosis(Speaks):
             "format": "tmlattice-diagnosis",
             "version": 2,
             "package": __version__,
-            "kind": self.kind,
             "model": self.ring.model,
             **record_of(self),
             "errors": [
@@ -555,7 +523,6 @@ class Diagnosis(Speaks):
                 }
                 for c, s, support in self.supported
             ],
-            **({"measurements": encoded(self.parts)} if self.parts else {}),
             "assessment": self.assessment.as_json(),
             "gap": self.gap,
             "unexplained": {"patterns": None, **self.unexplained},

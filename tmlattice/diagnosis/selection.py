@@ -16,6 +16,7 @@ from tmlattice.arrays import Array
 from tmlattice.effects import Cause, Hypothesis, LaunchEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
+from tmlattice.inference.alternatives import leading
 from tmlattice.inference.distributed import (
     MAX_ELEMENTS,
     DistributedErrors,
@@ -300,10 +301,12 @@ def _hidden(
     cause = outlier(estimate, small.sizes, search.problem.judgement)
     weigh = cause is not None and small.plain.alone  # else the reference has it too
     if not weigh:
-        cause = _leader(found)
-        if cause is None:
+        some = search.problem.judgement.alternatives
+        leaders = leading(found.problem, found.first, some)
+        if not leaders:
             return found, small
-        result = fit(found.problem, [cause], result.nuisances)
+        hypothesis, amount = next(iter(leaders.items()))
+        result = fit(found.problem, [Cause(*hypothesis, amount)], result.nuisances)
         if not result.good:
             return found, small
         cause = result.causes[0]
@@ -393,17 +396,3 @@ def outlier(
         return None
     ratio = abs(worst.amount) / (common * usual[worst.effect])
     return worst if chi2.sf(ratio**2, 1) * len(estimate) < judgement.false_alarm else None
-
-
-def _leader(explanation: Explanation) -> Cause | None:
-    """The leading hypothesis of the scan."""
-    scan = explanation.first
-    top = int(np.argmax(scan.statistic)) if len(scan.statistic) else -1
-    if top < 0 or not scan.statistic[top] > 0:
-        return None
-    name, place = scan.hypotheses[top]
-    effect = find(name)
-    if effect.discrete:
-        return None
-    root = min(abs(scan.amount[top]) ** (1 / effect.power), effect.largest)
-    return Cause(name, place, float(np.copysign(root, scan.amount[top])))

@@ -8,22 +8,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tmlattice.arrays import TINY, Array, Flags, rms
-from tmlattice.diagnosis.kinds import Part
-from tmlattice.diagnosis.prepare import same_monitors
+from tmlattice.arrays import TINY, Array, rms
+from tmlattice.diagnosis.prepare import Part
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.views import PartView, numbers_read
 from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
-from tmlattice.inference.distributed import DistributedProblem, FittedErrors, slopes_of
-from tmlattice.inference.judgement import SIGNIFICANT
+from tmlattice.inference.distributed import (
+    DistributedProblem,
+    FittedErrors,
+    as_readings,
+    slopes_of,
+)
 from tmlattice.inference.newton import STEP_SHARES, Fit, fit_nuisances
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.validation import Gap, Misfit, held_out_gap
+from tmlattice.inference.validation import Gap, Misfit, Residuals, held_out_gap, predicted
 from tmlattice.inference.whitening import Blocks
-from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
+from tmlattice.observe.first_turns import FirstTurns
 
 
 @dataclass(frozen=True)
@@ -96,10 +99,9 @@ def _settled(
     return Stage(some, own, point, share)
 
 
-def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
-    """Residuals in units of the noise, and the noise, of all or some readings of a problem."""
-    there = problem.valid if among is None else problem.valid & among
-    rows = problem.as_rows(there.astype(float))
+def _left(problem: Problem, point: Point) -> tuple[Array, Array]:
+    """Residuals in units of the noise, and the noise, of all readings of a problem."""
+    rows = problem.as_rows(problem.valid.astype(float))
     own = rows > 0
     return point.residual[own], 1 / rows[own]
 
@@ -126,14 +128,13 @@ def views_of(
     return tuple(views)
 
 
-def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = ()) -> Misfit:
+def misfit_of(pairs: Sequence[tuple[Problem, Point]]) -> Misfit:
     """The misfit of all readings; the rms of those in metres."""
     left, sizes = [], []
-    for i, (problem, point) in enumerate(pairs):
-        some = among[i] if among else problem.valid
-        own, noise = _left(problem, point, some)
+    for problem, point in pairs:
+        own, noise = _left(problem, point)
         left.append(own)
-        metres = (problem.owner() >= 0)[problem.valid & some]
+        metres = (problem.owner() >= 0)[problem.valid]
         sizes.append((own * noise)[metres])
     every = np.concatenate(left)
     chi2 = float(np.mean(every**2)) if len(every) else float("nan")
@@ -142,102 +143,89 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
 
 def held_out(
     parts: Sequence[Part],
-    fixed: tuple[Cause, ...],
-    stages: Sequence[Stage],
-    aside: set[str],
-    since: int,
-) -> Gap | None:
-    """Held-out shots: half of the BPMs determines the nuisances, the other half is the validation
-    set. Rejected BPMs are in neither."""
-    judges = []
-    for part in parts:
-        if (judge := part.heldout) is not None:
-            lost = [i for i, name in enumerate(judge.monitors) if name in aside]
-            judges.append(judge.without(np.isin(judge.owner(), lost)))
-    if not judges:
-        return None
-    misfits = []
-    for stage in stages:
-        pairs, among = [], []
-        for judge in judges:
-            causes = (*fixed, *stage.static, *stage.causes)
-            seen = tuple(c for c in causes if judge.sees((c.effect, c.element)))
-            there = replace(judge, fixed=seen)
-            scored = there.owner() % 2 == 1
-            gives = fit_nuisances(there.without(scored), (), there.first)
-            pairs.append((there, there.at((), gives.nuisances)))
-            among.append(scored)
-        misfits.append(misfit_of(pairs, among))
-    readings = sum(int((judge.valid & own).sum()) for judge, own in zip(judges, among, strict=True))
-    gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
-    before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    if readings and before > SIGNIFICANT * np.sqrt(2 / readings) and since < len(misfits) - 1:
-        return replace(gap, explained=1 - after / before)
-    return gap
-
-
-def held_out_shots(
-    part: Part,
     problem: CombinedProblem,
     found: Explanation,
     small: FittedErrors | None,
     stages: Sequence[Stage],
     since: int,
 ) -> Gap | None:
-    """Return the gap on held-out first turns, in the covariance of their prediction.
+    """The gap on the validation sets, at BPMs that the fit used; None without any.
 
-    Of the design; with the distributed errors, as in the fit without causes; with the findings,
-    one by one where there are no distributed errors.
+    The model's uncertainty by distributed errors is included for first turns alone: covariances of
+    other readings would be large.
+
+    Args:
+        parts: measurements.
+        problem: their problem, without rejected readings.
+        found: the explanation.
+        small: distributed errors, if there are any.
+        stages: the models.
+        since: index of the model with which the last one is compared.
     """
-    judge = part.heldout
-    if judge is None:
+    judges = []
+    for part, fitted in zip(parts, problem.parts, strict=False):
+        if (judge := part.heldout) is not None:
+            never = ~np.asarray(fitted.valid.any(axis=0))[: judge.valid.shape[1]]
+            unused = np.zeros(judge.valid.shape, dtype=bool)
+            unused[:, : len(never)] = never
+            judges.append(judge.without(unused))
+    if not judges:
         return None
-    assert isinstance(judge, FirstTurns)
-    assert isinstance(part.problem, FirstTurns)
-    dropped = found.dropped.reshape(part.problem.valid.shape)
-    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped))
-    scored = []
+    turns = len(parts) == 1 and isinstance(judges[0], FirstTurns)
+    models, residuals = list[list[Residuals]](), list[Array]()
     for i, stage in enumerate(stages):
-        model = judge.model
-        if problem.fixed or stage.static:
-            model = model.knowing([*problem.fixed, *stage.static])
-        unknown = None
-        if small is not None and i:
-            explained = found.fit if stage.causes or not found.fit.causes else found.before
-            about = replace(judge, model=model)
-            unknown = _unknown(small, explained, about, stage)
-        scored.append(held_out_residuals(replace(judge, model=model, fixed=stage.causes), unknown))
-    return held_out_gap(scored, since)
+        scored, left = list[Residuals](), list[Array]()
+        for judge in judges:
+            fixed, causes = (
+                [cause for cause in some if judge.sees((cause.effect, cause.element))]
+                for some in ((*problem.fixed, *stage.static), stage.causes)
+            )
+            there, errors, known = judge.with_fixed(fixed), None, 0
+            if turns and small is not None and i:
+                explained = found.fit if stage.causes or not found.fit.causes else found.before
+                errors, known = _unknown(small, explained, there, stage)
+            groups, residual = predicted(there.with_fixed(causes), errors, known)
+            scored += groups
+            left.append(residual)
+        models.append(scored)
+        residuals.append(left[0] if len(left) == 1 else np.concatenate([r.ravel() for r in left]))
+    gap = held_out_gap(models, since, np.array(residuals))
+    if small is None or turns:
+        return gap
+    design, *others = gap.misfits  # of these the uncertainty is not known
+    return replace(gap, misfits=(design, *(replace(one, expected=None) for one in others)))
 
 
-def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
-    """The covariance of the prediction of other shots, [shot * reading * 2] twice, m^2; None where
-    their beam is lost.
+def _unknown(
+    small: FittedErrors, explained: Fit, other: Problem, stage: Stage
+) -> tuple[Array | None, int]:
+    """The errors of the prediction of other readings, of size 1, m, [error, *shape of `valid`], of
+    which the readings of the fit removed the last ones, so many; None where their beam is lost.
 
     Of the distributed errors their posterior covariance, and of the amounts of the causes: as in
     universal kriging (Matheron 1969), whose drift launches and amounts are. `explained` is the fit
-    of the first shots; `other` has the distributed errors in its model.
+    of the first readings; `other` has the distributed errors in its model.
     """
     among = small.problem
-    point = other.at(stage.causes, other.data.launches)
+    point = other.at(stage.causes, other.first)
     if point.lost:
-        return None
+        return None, 0
     known = among.known
     amounts = np.array([cause.amount for cause in stage.static])
     there = known.rms[:, None] * slopes_of(other, point, known, amounts)
     there = known.correlated(there)
     here = explained.projection.out(among.white_rows)
-    rows = there.T @ here
-    unknown = there.T @ there - rows @ rows.T
+    errors, removed = [there], here.T @ there
     slopes = [explained.slopes.get((c.effect, c.element)) for c in stage.causes]
     for_each = [i for i, slope in enumerate(slopes) if slope is not None]
     if for_each:
         seen = np.array([slope.row for slope in slopes if slope is not None])
-        drift = np.array([other.metres(other.slope(point, i)) for i in for_each]) - seen @ (
-            here.T @ there
-        )
-        unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
-    return np.asarray(unknown)
+        own = np.array([other.slope(point, i) for i in for_each])
+        drift = as_readings(other, own) - seen @ removed
+        values, vectors = np.linalg.eigh(explained.covariance[np.ix_(for_each, for_each)])
+        errors.append((vectors * np.sqrt(np.maximum(values, 0.0))).T @ drift)
+    rows = np.concatenate([*errors, removed])
+    return rows.reshape(-1, *other.valid.shape), len(removed)
 
 
 def seen_by(

@@ -30,9 +30,9 @@ class Tables(Mapping[str, Any]):
       share_from_data, probability, statistic, p_value, s_from, s_to, action.
     - `errors`: a row an amount: effect, element, device, s, amount, sigma, unit, share_from_data,
       determined.
-    - `bpms`, `correctors`: a row an element: device, s, rejected (its planes, or "xy"), and of each
-      fitted effect a column of that name, one `_sigma` and one `_share`; `attrs["units"]` has their
-      units.
+    - `bpms`, `correctors`: a row an element: device, s, rejected_channels (its planes, or
+      "xy"), and of each fitted effect a column of that name, one `_sigma` and one `_share`;
+      `attrs["units"]` has their units.
     - `optics`: beta, dispersion and closed orbit of the design and of the estimated ring at the
       start and at the exit of each magnet; `attrs["tunes"]` has the fractional tunes of both.
     - `steps`: a row for the design, the fit, and the fit given faults, of an orbit response.

@@ -16,7 +16,7 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.diagnosis.views import JointView, ResponseView, TrajectoryView
+from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, Hypothesis, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
@@ -57,20 +57,20 @@ def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
     hierarchical fit. Where that stores no beam, or takes too long, each error of the fit has its
     own standard deviation, without correlations.
     """
-    view = diagnosis.view
-    if isinstance(view, JointView | TrajectoryView):
-        found, causes = view.explanation, diagnosis.causes
-        if not isinstance(found.problem, DistributedProblem):
-            return None
-        known = found.problem.learnt(found.fit if causes else found.before)
-        beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
-        return replace(known, causes=(*known.causes, *beside))
     if diagnosis.stored:
         raise MeasurementError(
             "diagnosis.json does not hold the covariance of the errors: take the files of "
             "--lattice-out, or a pickle of the diagnosis"
         )
-    if not isinstance(view, ResponseView) or not diagnosis.steps or diagnosis.since_reference:
+    if not diagnosis.by_families:
+        found, causes = diagnosis.explanation, diagnosis.causes
+        if not isinstance(found.problem, DistributedProblem):
+            return None
+        known = found.problem.learnt(found.fit if causes else found.before)
+        beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
+        return replace(known, causes=(*known.causes, *beside))
+    view = diagnosis.response
+    if not diagnosis.steps or diagnosis.since_reference:
         return None  # of a change the distributed errors are the reference's
     usual = background_rms({"all": None})
     everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]

@@ -100,7 +100,7 @@ class PartView:
         label, kind: what the user calls it, and what it is.
         readings: their number.
         before, after: what the design and the result leave.
-        monitors: names.
+        monitors: names; none after loading.
         left: rms residual at each BPM in units of the noise, before and after,
             [2, monitor]; NaN where nothing was read.
         numbers: of tunes, each as read and as both models have it.
@@ -111,36 +111,6 @@ class PartView:
     readings: int
     before: Misfit
     after: Misfit
-    monitors: tuple[str, ...] = field(metadata=HIDDEN)
-    left: Array = field(repr=False, metadata=HIDDEN)
+    monitors: tuple[str, ...] = field(default=(), metadata=HIDDEN)
+    left: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False, metadata=HIDDEN)
     numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
-
-
-@dataclass(frozen=True, eq=False)
-class StoredView:
-    """What the file of a diagnosis keeps of its measurement.
-
-    Attributes:
-        kind: of the measurement, see `Diagnosis.kind`.
-        parts: the measurements, without their monitors' residuals.
-        measured: quantities of the stored beam that were measured.
-        correctors: how many of an orbit response were held out; None: no response.
-    """
-
-    kind: str
-    parts: tuple[PartView, ...]
-    measured: tuple[str, ...]
-    correctors: int | None
-
-
-@dataclass(frozen=True, eq=False)
-class JointView:
-    """The view of a stored beam's measurements, or of several together, for plots.
-
-    Attributes:
-        explanation: the search.
-        parts: the measurements.
-    """
-
-    explanation: Explanation
-    parts: tuple[PartView, ...]

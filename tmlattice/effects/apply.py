@@ -58,7 +58,8 @@ def apply(ring: Ring, causes: Iterable[Cause], settings: Settings | None = None)
     """
     causes = list(causes)
     check(ring, causes)
-    return ring.with_elements(changed_elements(ring, causes, settings))
+    changed = changed_elements(ring, causes, settings)
+    return ring.with_elements(changed) if changed else ring
 
 
 def set_elements(ring: Ring, settings: Settings) -> dict[int, Element]:

@@ -4,17 +4,14 @@ They state physical quantities; their effect on the beam is the engine's, so tha
 model's maps is shared.
 """
 
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
-Where = Literal["entrance", "middle"]
+from tmlattice.lattice.ring import Slopes, summed
 
 
 @dataclass
 class Build:
-    """Differences of the element from the design.
+    """Differences of the element from the design; those of `lattice.ring.Errors` have their names.
 
     Attributes:
         scale: of its strength: a quadrupole's or sextupole's, a bend's field, a corrector's kick.
@@ -24,8 +21,10 @@ class Build:
         kick_x, kick_y: of a corrector beyond its setting, along its own axes, rad.
         k1: gradient of a bend beyond its own, 1/m2.
         loss: energy loss, in units of the expected one.
-        gradients: thin quadrupoles, by place (normal, skew), 1/m; see `add_gradient`.
-        slopes: other thin kicks, by place, 1/m; see `add_slopes`.
+        k1l, k1sl: thin quadrupole in the middle, px -= k1l x, py += k1l y, and a skew one,
+            px += k1sl y, py += k1sl x, 1/m.
+        entrance_k1l: thin quadrupole at the entrance, 1/m.
+        entrance, middle: other thin kicks there, 1/m.
     """
 
     scale: float = 1.0
@@ -37,17 +36,12 @@ class Build:
     kick_y: float = 0.0
     k1: float = 0.0
     loss: float = 0.0
-    gradients: dict[Where, tuple[float, ...]] = field(default_factory=lambda: defaultdict(tuple))
-    slopes: dict[Where, tuple[float, ...]] = field(default_factory=lambda: defaultdict(tuple))
+    k1l: float = 0.0
+    k1sl: float = 0.0
+    entrance_k1l: float = 0.0
+    entrance: Slopes = (0.0, 0.0, 0.0, 0.0)
+    middle: Slopes = (0.0, 0.0, 0.0, 0.0)
 
-    def add_gradient(self, where: Where, normal: float = 0.0, skew: float = 0.0) -> None:
-        """A thin quadrupole, px -= normal x, py += normal y, and a skew one, px += skew y, ..."""
-        self.gradients[where] = _sum(self.gradients[where], (normal, skew))
-
-    def add_slopes(self, where: Where, *slopes: float) -> None:
-        """A thin kick of (d px / dx, d px / dy, d py / dx, d py / dy)."""
-        self.slopes[where] = _sum(self.slopes[where], slopes)
-
-
-def _sum(old: Sequence[float], new: Sequence[float]) -> tuple[float, ...]:
-    return tuple(a + b for a, b in zip(old or (0.0,) * len(new), new, strict=True))
+    def add(self, name: str, amount: float | Slopes) -> None:
+        """Add an amount to one of the differences."""
+        setattr(self, name, summed(getattr(self, name), amount))

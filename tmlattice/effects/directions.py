@@ -111,6 +111,11 @@ def _read(layers: LayerMaps, hypotheses: Sequence[Hypothesis], content: bytes) -
     return kept
 
 
+REMEMBERED = 20_000
+"""Hypotheses whose directions are in the memory of a ring's maps: more than one scan has. Beyond,
+the oldest are removed."""
+
+
 def directions_nearby(layers: LayerMaps, hypotheses: Sequence[Hypothesis]) -> Directions:
     """Return `directions`, cached with the maps; of changed maps only those of changed elements are
     computed anew."""
@@ -125,7 +130,13 @@ def directions_nearby(layers: LayerMaps, hypotheses: Sequence[Hypothesis]) -> Di
             if again:
                 found = found.replaced(again, directions(layers, [hypotheses[i] for i in again]))
         layers.memory[key] = found
-    remembered: Directions = layers.memory[key]
+        own = [
+            name for name in layers.memory if isinstance(name, tuple) and name[0] == "directions"
+        ]
+        while len(own) > 1 and sum(len(name[1]) for name in own) > REMEMBERED:
+            del layers.memory[own.pop(0)]
+    remembered: Directions = layers.memory.pop(key)
+    layers.memory[key] = remembered  # the latest
     return remembered
 
 

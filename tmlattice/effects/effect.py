@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.effects.build import Build, Where
+from tmlattice.effects.build import Build
 from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
@@ -249,8 +249,7 @@ class ErrorEffect(RingEffect):
     """An effect that is one of the errors which an element can carry.
 
     Attributes:
-        error: its name in `lattice.ring.Errors`, and in `Build`: dx, dy, ds, roll, kick_x
-            or kick_y.
+        error: its name in `lattice.ring.Errors`, and in `Build`.
     """
 
     error: ClassVar[str]
@@ -261,7 +260,7 @@ class ErrorEffect(RingEffect):
 
     def build(self, it: Build, amount: float) -> None:
         """Add to the engine's error of the same name."""
-        setattr(it, self.error, getattr(it, self.error) + amount)
+        it.add(self.error, amount)
 
 
 class OffsetX(ErrorEffect):
@@ -296,7 +295,7 @@ class ThinKickEffect(RingEffect):
 
     responds = True
     slopes: ClassVar[Slopes]
-    where: ClassVar[Where] = "middle"
+    where: ClassVar[Literal["entrance", "middle"]] = "middle"
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
         """Return the element with a further amount of the kick."""
@@ -304,7 +303,7 @@ class ThinKickEffect(RingEffect):
 
     def build(self, it: Build, amount: float) -> None:
         """Add the kick as a matrix."""
-        it.add_slopes(self.where, *(amount * slope for slope in self.slopes))
+        it.add(self.where, tuple(amount * slope for slope in self.slopes))
 
 
 class StrengthEffect(RingEffect):
@@ -386,6 +385,11 @@ MIN_FIELD = 0.1
 """Share of its field below which a magnet is broken: no setting compensates a factor of ten."""
 
 
+STEP = 1e-4
+"""Step of central differences by a monitor's error over the largest fault; no effect is of higher
+than second order there."""
+
+
 class ReadingEffect(Effect):
     """An effect on one monitor's readings."""
 
@@ -400,11 +404,25 @@ class ReadingEffect(Effect):
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add this amount to one or some of `monitors`, in place."""
 
-    def change(self, beam: Array, amount: float) -> Array:
-        """Reading of the beam [..., 2] (x, y), m, with this amount alone, less beam; 0 if dead."""
-        alone = Monitors.perfect(1)
-        self.set(alone, 0, amount)
-        return np.asarray(beam @ (alone.matrix()[0] - np.eye(2)).T + alone.constant()[0])
+    def slopes(self, monitors: Monitors) -> tuple[Array, Array]:
+        """Return the change of each monitor per amount that joins the errors that it has.
+
+        Args:
+            monitors: with their errors.
+
+        Returns:
+            d matrix / d amount, [monitor, 2, 2], and d constant / d amount, [monitor, 2], see
+            `Monitors`; of a discrete effect both changes, NaN where the signal vanishes.
+        """
+        high = 1.0 if self.discrete else STEP * self.largest
+        low = 0.0 if self.discrete else -high
+        up, down = monitors.copy(), monitors.copy()
+        self.set(up, slice(None), high)
+        if low:
+            self.set(down, slice(None), low)
+        constant = up.constant() - down.constant()
+        constant[up.silent & ~down.silent] = np.nan
+        return (up.matrix() - down.matrix()) / (high - low), constant / (high - low)
 
 
 class LaunchEffect(Effect):

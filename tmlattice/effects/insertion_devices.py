@@ -1,6 +1,5 @@
 """Errors of wigglers and undulators."""
 
-from tmlattice.effects.build import Build
 from tmlattice.effects.effect import ErrorEffect, ThinKickEffect, register
 from tmlattice.lattice import Element
 
@@ -25,10 +24,6 @@ class InsertionDeviceFocusing(ErrorEffect):
     )
     largest = 0.03
     sits_on_text = "wigglers, matrix elements"
-
-    def build(self, it: Build, amount: float) -> None:
-        """Add a thin quadrupole."""
-        it.add_gradient("entrance", normal=amount)
 
     def sits_on(self, element: Element) -> bool:
         """Whether an element is a wiggler, or a matrix of any name."""

@@ -1,6 +1,5 @@
 """Errors of quadrupoles, and gradients anywhere."""
 
-from tmlattice.effects.build import Build
 from tmlattice.effects.effect import (
     ErrorEffect,
     FamilyEffect,
@@ -70,10 +69,6 @@ class GradientAbsolute(_Gradient, ErrorEffect):
     )
     sign = "integrated k1 L, thin, in the middle: px -= amount x, py += amount y"
 
-    def build(self, it: Build, amount: float) -> None:
-        """Add a thin quadrupole."""
-        it.add_gradient("middle", normal=amount)
-
     def corrected_as(self, element: Element) -> tuple[str, float]:
         """Return a powered quadrupole's own gradient, or a wiggler's focusing."""
         if element.kind == "quadrupole" and element.k1 * element.length != 0:
@@ -103,10 +98,6 @@ class SkewGradient(_Gradient, ErrorEffect):
         "beam."
     )
     sign = "integrated k1s L, thin, in the middle: px += amount y, py += amount x"
-
-    def build(self, it: Build, amount: float) -> None:
-        """Add a thin skew quadrupole."""
-        it.add_gradient("middle", skew=amount)
 
     def corrected_as(self, element: Element) -> tuple[str, float]:
         """Return the roll of a powered quadrupole: theta has k1s L = -2 theta k1 L."""

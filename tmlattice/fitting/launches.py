@@ -53,7 +53,7 @@ def with_noise(
     start = fit(FirstTurns(model=model, data=data, places={}), (), data.launches)
     if start.point.lost:
         raise BeamLostError(f"{start.point.lost} in '{ring.name}'; check the launches")
-    found = estimate(data, start.point.view)
+    found = estimate([(data, start.point.view)])
     if not np.isfinite(found).any():
         raise MeasurementError(
             "the noise is not stated and the readings are too few to estimate it; state the noise "

@@ -89,7 +89,10 @@ def most_probable(
         model = problem.model.knowing([Cause(*h, a) for h, a in own])
         there = replace(problem, model=model)
         point = fit_nuisances(there, (), nuisances)
-        assert point.projection is not None, point.lost
+        if point.projection is None:
+            raise UnstableRingError(
+                f"{point.lost} with the fitted magnets; test the measurement by `tmlattice check`"
+            )
         nuisances = point.nuisances
         rows = there.metric(point).rows(hypotheses)
         residual = point.residual + amounts @ rows

@@ -10,8 +10,8 @@ import numpy as np
 
 from tmlattice.arrays import Array, Indices
 from tmlattice.beam import tangents as kernels
-from tmlattice.beam.model import Hypothesis, Model
-from tmlattice.effects import CATALOGUE, RingEffect, directions, names
+from tmlattice.beam.model import Model
+from tmlattice.effects import CATALOGUE, Hypothesis, RingEffect, directions, names
 from tmlattice.fitting.launches import with_noise
 from tmlattice.inference.newton import fit
 from tmlattice.lattice import Ring
@@ -86,13 +86,11 @@ class Split:
         amount, sigma: of every effect, all effects of its layer at once, in its unit; the smallest
             ones for dependent effects, [hypothesis].
         parts: norms of the parts, see `PARTS`, in sigma, [layer, 3].
-        freedom: number of directions of each part, [layer, 3].
     """
 
     amount: Array
     sigma: Array
     parts: Array
-    freedom: Indices
 
     @property
     def shares(self) -> Array:
@@ -207,7 +205,7 @@ def split(seen: Trajectories, effects: LayerEffects, weights: Array) -> Split:
     kicked, trajectory = seen.roots(), seen.ensemble()
     rows = stacked((effects.D0, effects.D1, effects.D2))
     together, sigma = np.zeros(len(rows)), np.full(len(rows), np.inf)
-    parts, freedom = np.zeros((len(weights), 3)), np.zeros((len(weights), 3), dtype=np.int64)
+    parts = np.zeros((len(weights), 3))
     order = np.argsort(effects.layer, kind="stable")
     first = np.searchsorted(effects.layer[order], np.arange(len(weights) + 1))
     for k in np.flatnonzero(kicked.any(axis=(1, 2))):
@@ -238,7 +236,4 @@ def split(seen: Trajectories, effects: LayerEffects, weights: Array) -> Split:
         along = symplectic.T @ vector
         rest = vector - physical @ inside - symplectic @ along
         parts[k] = [np.linalg.norm(part) for part in (inside, along, rest)]
-        seen_weights = np.linalg.matrix_rank(left) * np.linalg.matrix_rank(right)
-        freedom[k, :2] = physical.shape[1], symplectic.shape[1]
-        freedom[k, 2] = seen_weights - freedom[k, :2].sum()
-    return Split(together, sigma, parts, freedom)
+    return Split(together, sigma, parts)

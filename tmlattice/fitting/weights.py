@@ -31,7 +31,8 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import INVISIBLE, Array, Indices
-from tmlattice.beam.model import Hypothesis, Model
+from tmlattice.beam.model import Model
+from tmlattice.effects import Hypothesis
 from tmlattice.errors import LatticeError, MeasurementError
 from tmlattice.fitting.weight_parts import (
     PARTS,

@@ -66,7 +66,7 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
     try:
         contradicted = [check.sentence for check in check_data(ring, measured).reported]
         contradicted += _per_kick(OfResponse(ring, replace(measured, rf=None)))
-        model, flat = ResponseModel(ring), ResponseModel(ring, dimension=4)
+        model, flat = ResponseModel.of(ring), ResponseModel.of(ring, dimension=4)
     except UnstableRingError as error:
         return [], [f"the lattice has no closed orbit to compare with ({error})"]
     confirmed: list[str] = []

@@ -66,20 +66,27 @@ class CombinedProblem(Problem):
 
     @property
     def alone(self) -> bool:
-        """Whether no part is, or contains, a reference."""
-        return all(self.active) and all(part.alone for part in self.parts)
+        """Whether no part is a reference."""
+        return all(self.active)
 
-    def reference(self, nuisances: Array) -> "tuple[CombinedProblem, Array]":
-        """Return the problem of the reference measurements or shots, and its nuisances."""
-        parts: list[tuple[Problem, Array]] = []
-        for part, active, start in zip(
-            self.parts, self.active, self.of_parts(nuisances), strict=True
-        ):
-            own, first = part.reference(start) if active else (part, start)
-            parts += [] if own is None else [(own, first)]
-        problems, starts = zip(*parts, strict=True)
-        found = replace(self, parts=problems, starts=starts, active=(True,) * len(parts))
-        return found, found.first
+    @property
+    def reference(self) -> "CombinedProblem":
+        """The problem of the reference measurements."""
+        own = zip(self.parts, self.starts, self.active, strict=True)
+        parts, starts = zip(*((p, s) for p, s, active in own if not active), strict=True)
+        return replace(self, parts=parts, starts=starts, active=(True,) * len(parts))
+
+    @property
+    def _only(self) -> int | None:
+        """The one part in which causes are sought, None: there are several."""
+        first, *others = (i for i, active in enumerate(self.active) if active)
+        return None if others else first
+
+    @staticmethod
+    def _rows(point: Point, part: int) -> slice:
+        """Rows of a part."""
+        begin = sum(len(own.residual) for own in point.view[:part])
+        return slice(begin, begin + len(point.view[part].residual))
 
     # --- nuisances: one flat vector -------------------------------------------------------------
     @property
@@ -115,10 +122,9 @@ class CombinedProblem(Problem):
 
     def everywhere(self) -> "CombinedProblem":
         """Return the problem with causes that act in all parts."""
-        if self.alone:  # they do, and the models of the parts are made
-            return self
-        parts = tuple(part.everywhere() for part in self.parts)
-        return replace(self, parts=parts, active=(True,) * len(parts))
+        other = replace(self, active=(True,) * len(self.parts))
+        vars(other)["parts_with_fixed"] = self.parts_with_fixed  # whose models are made
+        return other
 
     @cached_property
     def parts_with_fixed(self) -> tuple[Problem, ...]:
@@ -144,7 +150,7 @@ class CombinedProblem(Problem):
         ):
             there = causes if active else ()
             seen = [c for c in there if part.sees((c.effect, c.element))]
-            points.append(part.at(seen, own, kicks))
+            points.append(part.at(seen, own, kicks if active else NO_KICKS))
             if points[-1].lost:  # the other parts are not needed
                 rest = np.full(1, np.nan)
                 return Point(
@@ -175,21 +181,28 @@ class CombinedProblem(Problem):
             return self.parts_with_fixed[0].metric(point.view[0])
         return _CombinedMetric(self, point)
 
-    def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
+    def metric_among(
+        self, point: Point, root: Root, rows: slice, projection: Projection
+    ) -> Metric | None:
         """Return the products of a single measurement, as its kind has them."""
-        if len(self.parts) > 1:
+        if self._only is None:
             return None
-        return self.parts_with_fixed[0].metric_among(point.view[0], root, projection)
+        part, here = self.parts_with_fixed[self._only], point.view[self._only]
+        return part.metric_among(here, root, self._rows(point, self._only), projection)
 
     # --- free kicks: of a single measurement ----------------------------------------------------
     @property
     def kick_places(self) -> Sequence[str]:
         """Places of free kicks of a single measurement; several have no kick in common."""
-        return self.parts[0].kick_places if len(self.parts) == 1 else ()
+        return () if self._only is None else self.parts[self._only].kick_places
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """Return the rows of a single measurement, as its kind has them."""
-        return self.parts_with_fixed[0].kick_rows(point.view[0], place)
+        """Return the rows of a single measurement, zero in its reference."""
+        assert self._only is not None
+        own = self.parts_with_fixed[self._only].kick_rows(point.view[self._only], place)
+        rows = np.zeros((len(own), len(point.residual)))
+        rows[:, self._rows(point, self._only)] = own
+        return rows
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the neighbours in any part."""
@@ -229,16 +242,21 @@ class CombinedProblem(Problem):
         return np.concatenate(rows, axis=-1)
 
     def noise_rows(self) -> list[Flags]:
-        """Return the noise rows of a single measurement; of several: none."""
-        return self.parts[0].noise_rows() if len(self.parts) == 1 else []
+        """Return the noise rows of a single measurement, with its reference; of several: none."""
+        if self._only is None:
+            return []
+        own = [part.noise_rows() for part in self.parts]
+        alike = len({len(rows) for rows in own}) == 1
+        return [np.concatenate(rows) for rows in zip(*own, strict=True)] if alike else []
 
     def noisier(self, factors: Array) -> Self:
-        """Return the problem with scaled noise, of a single measurement."""
+        """Return the problem with scaled noise, the same in all parts."""
         return replace(self, parts=tuple(part.noisier(factors) for part in self.parts))
 
     def disagreement(self, point: Point) -> float:
         """Return the disagreement of a single measurement; of several: 0."""
-        return self.parts[0].disagreement(point.view[0]) if len(self.parts) == 1 else 0.0
+        only = self._only
+        return 0.0 if only is None else self.parts[only].disagreement(point.view[only])
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """Return the residuals and their variances, part after part."""
@@ -300,17 +318,25 @@ class _CombinedMetric(Metric):
             parts.append(out)
         return np.concatenate(parts, axis=1)
 
+    def free_kicks(self, places: Indices, clean: Array) -> tuple[Array, Array]:
+        """Return the information of the one measurement in which causes are sought."""
+        only = self.problem._only
+        assert only is not None
+        mine = np.ascontiguousarray(self.blocks.split(clean)[only])
+        return self.metrics[only].free_kicks(places, mine)
+
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Return the information; a monitor's readings in each measurement are a block."""
+        """Return the information; a monitor's readings in each measurement are a block. In a
+        reference they are not free: what is sought is not there."""
         problem = self.problem
         at = {name: i for i, name in enumerate(problem.names)}
         found = []
-        for part, metric, mine in zip(
-            problem.parts, self.metrics, self.blocks.split(clean), strict=True
+        for part, active, metric, mine in zip(
+            problem.parts, problem.active, self.metrics, self.blocks.split(clean), strict=True
         ):
-            found.append(
-                (*metric.free_monitors(np.ascontiguousarray(mine)), [at[m] for m in part.monitors])
-            )
+            if active:
+                own = metric.free_monitors(np.ascontiguousarray(mine))
+                found.append((*own, [at[m] for m in part.monitors]))
         size = max(gram.shape[-1] for gram, _, _ in found)
         blocks = sum(gram.shape[1] for gram, _, _ in found)
         grams = np.zeros((len(at), blocks, size, size))

@@ -218,16 +218,13 @@ class MarginalProblem(Problem):
     def metric(self, point: Point) -> Metric:
         """Return the kind's own products, or those of whitened signatures."""
         assert point.projection is not None
-        fast = self.inner.metric_among(point.view, self._root, point.projection)
+        every = slice(0, len(point.residual))
+        fast = self.inner.metric_among(point.view, self._root, every, point.projection)
         return _MarginalMetric(self, point) if fast is None else fast
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """Return the whitened rows, [parameter, row]."""
         return self.white(self.inner.kick_rows(point.view, place))
-
-    def everywhere(self) -> Self:
-        """As in the inner problem."""
-        return replace(self, inner=self.inner.everywhere())
 
     def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with further fixed causes and the same errors."""
@@ -492,15 +489,22 @@ def slopes_of(problem: Problem, point: Point, known: DistributedErrors, amounts:
     The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
     """
     hypotheses = known.hypotheses
-    unit = problem.as_rows(np.ones(problem.valid.shape))
-    linearised_at, there = problem.everywhere().metric(point), unit > 0
+    linearised_at = problem.everywhere().metric(point)
     out = np.zeros((len(hypotheses), problem.valid.size))
-    count = max(AT_ONCE // len(unit), 1)
+    count = max(AT_ONCE // len(point.residual), 1)
     for start in range(0, len(hypotheses), count):
         some = slice(start, start + count)
-        rows = linearised_at.rows(hypotheses[some])
-        out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
+        out[some] = as_readings(problem, linearised_at.rows(hypotheses[some]))
     out *= chain_factors(known, amounts)[:, None]
+    return out
+
+
+def as_readings(problem: Problem, rows: Array) -> Array:
+    """Readings [..., flat] of rows [..., row]; 0 where missing. Their noise is uncorrelated."""
+    unit = problem.as_rows(np.ones(problem.valid.shape))
+    there = unit > 0
+    out = np.zeros((*rows.shape[:-1], problem.valid.size))
+    out[..., problem.valid.ravel()] = rows[..., there] / unit[there]
     return out
 
 

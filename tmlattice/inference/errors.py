@@ -30,12 +30,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from tmlattice.arrays import ROUNDING, TINY, Array, Flags, Indices
 from tmlattice.inference.newton import ITERATIONS, SETTLED
 from tmlattice.inference.normal import (
     Normal,
     Slopes,
+    in_basis,
     inverse_by_factor,
     inverse_of_lower,
     lower_factor,
@@ -113,7 +115,7 @@ def cluster_robust_errors(
         weight: 1 / variance, 0 where missing, [column, monitor].
         residual: of the fit, [column, monitor].
         found: the fit.
-        taken: L of `inference.common.common`, the readings' common modes, [column, monitor,
+        taken: L of `inference.normal.common`, the readings' common modes, [column, monitor,
             pattern]; None: no common modes.
 
     Returns:
@@ -286,22 +288,20 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
         groups: priors with their scales.
         start: base parameters of the residual, [parameter].
     """
-    basis = np.concatenate([group.basis for group in groups], axis=1)
     priors = _Mixtures(groups)
     unit = np.sqrt(priors.variance)  # scales the matrix
-    A = (basis * unit).T @ normal.matrix @ (basis * unit)
+    basis = csr_array(np.concatenate([group.basis for group in groups], axis=1) * unit)
+    A, b = in_basis(normal, basis, start)
     A[np.diag_indices(len(A))] *= 1 + ROUNDING
-    b = unit * (basis.T @ (normal.vector + normal.matrix @ start))
     priors.square /= priors.variance[:, None]
     precision, pull = np.ones(len(A)), np.zeros(len(A))
-    rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
+    rest = 1 / _marginals(A, b)[1] - 1
     open_ = rest * priors.square.min(axis=1) < DATA_ALONE  # the prior matters for these alone
     if open_.any():
         within, score, _ = _integrated(A, b, open_)
         precision[open_], pull[open_] = _sites(within, score, priors.some(open_))
-    mean, covariance = _gaussian(A, b, precision, pull)
-    scaled = basis * unit
-    return Moments(scaled @ mean, scaled @ covariance @ scaled.T)
+    covariance = inverse_by_factor(lower_factor(A + np.diag(precision)))
+    return Moments(basis @ (covariance @ (b + pull)), (basis @ covariance) @ basis.T)
 
 
 def _integrated(A: Array, b: Array, kept: Flags) -> tuple[Array, Array, Array]:
@@ -318,8 +318,7 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
     """Precisions and shifts of the Gaussians in place of the priors."""
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     for _ in range(ITERATIONS):
-        half = inverse_of_lower(lower_factor(A + np.diag(precision)))
-        mean, variance = half.T @ (half @ (b + pull)), np.einsum("ij,ij->j", half, half)
+        mean, variance = _marginals(A, b, precision, pull)
         rest = np.maximum(1 / variance - precision, 0.0)
         others = mean / variance - pull
         center, spread = priors.times(rest, others)
@@ -337,10 +336,12 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
     return precision, pull
 
 
-def _gaussian(A: Array, b: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Mean and covariance with Gaussian priors of these precisions and shifts."""
-    covariance = inverse_by_factor(lower_factor(A + np.diag(precision)))
-    return covariance @ (b + pull), covariance
+def _marginals(
+    A: Array, b: Array, precision: Array | float = 1.0, pull: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Mean and variance of each member with Gaussian priors of these precisions and shifts."""
+    half = inverse_of_lower(lower_factor(A + precision * np.eye(len(A))))
+    return half.T @ (half @ (b + pull)), np.einsum("ij,ij->j", half, half)
 
 
 KNOWN_MEMBERS = 6.0
@@ -370,13 +371,12 @@ def scale_covariance(
     groups = [group for group in groups if group.basis.any()]
     if not groups:
         return np.zeros((len(start), 0))
-    basis = np.concatenate([group.basis * group.scale for group in groups], axis=1)
+    basis = csr_array(np.concatenate([group.basis * group.scale for group in groups], axis=1))
     own = np.repeat(np.arange(len(groups)), [group.basis.shape[1] for group in groups])
     absent = np.array([group.name in gone for group in groups])
-    A = basis.T @ normal.matrix @ basis
+    A, b = in_basis(normal, basis, start)
     A[np.diag_indices(len(A))] *= 1 + ROUNDING
-    b = basis.T @ (normal.vector + normal.matrix @ start)
-    known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
+    known = np.where(absent[own], 0.0, 1 - _marginals(A, b)[1])
     unsure = np.array([
         absent[i]
         or (not group.fixed and (own == i).sum() <= MAX_MEMBERS

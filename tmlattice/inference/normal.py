@@ -11,7 +11,8 @@ the inverse covariance
     (W^-1 + P^T P)^-1 = W - L L^T,   L = W P^T R^-T,   R R^T = 1 + P W P^T.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -22,12 +23,17 @@ from scipy.linalg.blas import dsyrk, dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import ROUNDING, Array, Indices
+from tmlattice.arrays import ROUNDING, Array, Indices, Reals
 from tmlattice.compiled import jit_sums
 from tmlattice.inference.priors import Group
 
+LEARNT = 0.02
+"""Change of a log scale below which a round of EM is the last."""
+
 AT_ONCE = 2048
 """Readings weighed at a time: enough for matrix products, within the cache."""
+ERRORS_AT_ONCE = 8
+"""Errors whose derivatives are in double precision at a time: within the cache, too."""
 
 
 def _root(weight: Array, patterns: Array) -> tuple[Array, Array]:
@@ -86,20 +92,39 @@ def times_precision(weight: Array, taken: Array, residual: Array) -> Array:
 class Slopes(NamedTuple):
     """Derivatives by one family of errors.
 
+    Single precision is enough for `rows`, of which a large ring has a gigabyte: normal equations
+    and gradient have the same ones, so that a rounded derivative is that of a slightly other model.
+    Sums over them are of double precision.
+
     Attributes:
         rows: d reading / d error as computed, [error, column, monitor].
         now: factor since then, [column, monitor]; None: 1.
     """
 
-    rows: Array
+    rows: Reals
     now: Array | None = None
+
+    def _doubles(self) -> Iterator[tuple[slice, Array]]:
+        """Some rows at a time, in double precision."""
+        for low in range(0, len(self.rows), ERRORS_AT_ONCE):
+            some = slice(low, low + ERRORS_AT_ONCE)
+            yield some, np.asarray(self.rows[some], dtype=float)
 
     def times(self, readings: Array) -> Array:
         """Readings [..., column, monitor] times the derivatives, summed, [error, ...]."""
         own = readings if self.now is None else self.now * readings
-        flat = self.rows.reshape(len(self.rows), int(np.prod(self.rows.shape[1:])))
-        summed = flat @ own.reshape(-1, flat.shape[1]).T
-        return np.asarray(summed.reshape(len(self.rows), *readings.shape[:-2]))
+        flat = own.reshape(-1, math.prod(own.shape[-2:]))
+        summed = np.empty((len(self.rows), len(flat)))
+        for some, rows in self._doubles():
+            summed[some] = rows.reshape(len(rows), -1) @ flat.T
+        return summed.reshape(len(self.rows), *readings.shape[:-2])
+
+    def readings(self, amounts: Array) -> Array:
+        """Change of the readings by amounts of the errors, [column, monitor]."""
+        own = np.zeros(self.rows.shape[1:])
+        for some, rows in self._doubles():
+            own += np.tensordot(amounts[some], rows, 1)
+        return own if self.now is None else self.now * own
 
     def of(self, column: int | Indices, monitor: Indices) -> Array:
         """Derivatives of some readings, [error, reading]."""
@@ -110,7 +135,10 @@ class Slopes(NamedTuple):
         """Derivatives times [column, monitor, pattern], summed over monitors, [error, column,
         pattern]."""
         own = patterns if self.now is None else self.now[:, :, None] * patterns
-        return np.asarray((self.rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2))
+        out = np.empty((len(self.rows), *own.shape[::2]))
+        for some, rows in self._doubles():
+            out[some] = (rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2)
+        return out
 
 
 # `reassoc`: the sum may follow the vector unit's order.
@@ -243,6 +271,14 @@ def shared_by(
     return out
 
 
+def in_basis(normal: Normal, basis: csr_array, start: Array) -> tuple[Array, Array]:
+    """Matrix [p, p] and vector [p] of the normal equations for amounts of the columns of a basis
+    [parameter, p], in place of changes from `start`."""
+    # by rows, for `lower_factor`; the matrix is symmetric
+    matrix = basis.T @ (basis.T @ normal.matrix).T
+    return matrix, basis.T @ (normal.vector + normal.matrix @ start)
+
+
 @dataclass(frozen=True)
 class Posterior:
     """Posterior of a linear fit.
@@ -267,9 +303,14 @@ class Posterior:
         return -float(np.log(np.diag(self.factor)).sum())
 
     @cached_property
-    def spread(self) -> Array:
+    def spread(self) -> csr_array:
         """Basis times prior rms, [parameter, p]."""
-        return np.asarray(self.basis.toarray() * self.prior)
+        return csr_array(self.basis.multiply(self.prior))
+
+    @property
+    def before(self) -> Array:
+        """Prior rms of the base parameters, [parameter]."""
+        return np.asarray(np.sqrt(self.spread.power(2).sum(axis=1)))
 
     @cached_property
     def covariance(self) -> Array:
@@ -284,7 +325,7 @@ class Posterior:
     @property
     def sigma(self) -> Array:
         """Posterior standard deviations of the base parameters, [parameter]."""
-        square = ((self.spread @ self.covariance) * self.spread).sum(axis=1)
+        square = self.spread.multiply(self.spread @ self.covariance).sum(axis=1)
         return np.asarray(np.sqrt(np.maximum(square, 0)))
 
     def solved(self, vector: Array) -> Array:
@@ -307,15 +348,14 @@ def solve(
         groups: zero-mean priors; every free base parameter is in one of them.
         start: base parameters of the residual; None: zero.
         step_bound: rms of the step of each; None: unbounded. It does not change the fixed point.
-        rounds: of EM; 0: the priors stay.
+        rounds: largest number of rounds of EM; 0: the priors stay.
     """
     known = np.zeros(len(normal.vector)) if start is None else start
     groups = tuple(groups)
     basis = csr_array(np.concatenate([g.basis for g in groups], axis=1))  # sparse
     edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
     base = normal.matrix if step_bound is None else normal.matrix + np.diag(step_bound**-2)
-    A = basis.T @ (basis.T @ base).T
-    b = basis.T @ (normal.vector + base @ known)
+    A, b = in_basis(Normal(base, normal.vector), basis, known)
     for turn in range(max(rounds, 1)):
         prior = np.concatenate([g.scale for g in groups])
         # in units of the priors: well scaled
@@ -330,6 +370,9 @@ def solve(
             left = np.einsum("ij,ij->j", half, half)  # diagonal of the covariance
             parts = np.split(found**2, edges), np.split(left, edges)
             groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))
+            now = np.concatenate([g.scale for g in groups])
+            if np.abs(np.log(now / prior)).max(initial=0.0) < LEARNT:
+                break
     return Posterior(basis @ found, groups, basis, prior, factor)
 
 

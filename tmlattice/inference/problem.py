@@ -214,10 +214,6 @@ class Problem(ABC):
         """Whether the causes sought act on all readings, so that none is a reference."""
         return True
 
-    def reference(self, nuisances: Array) -> "tuple[Problem | None, Array]":
-        """Return the reference part and its nuisances; None: there is no reference."""
-        return None, nuisances
-
     @property
     def log_scale(self) -> float:
         """Log density of the rows at their peak, relative to the readings' noise alone."""
@@ -261,12 +257,15 @@ class Problem(ABC):
         not estimated from them."""
         return np.inf
 
-    def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
+    def metric_among(
+        self, point: Point, root: Root, rows: slice, projection: Projection
+    ) -> Metric | None:
         """Return the products given distributed errors, if the kind has a fast way to form them.
 
         Args:
             point: of this problem.
-            root: whitens its rows.
+            root: whitens its rows, perhaps with those of other measurements.
+            rows: its own among these.
             projection: of the nuisances, in white rows.
         """
         return None

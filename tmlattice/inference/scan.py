@@ -188,11 +188,11 @@ def free_scan(gram: Array, inner: Array) -> FreeScan:
 
 
 def scan_kicks(metric: Metric, layers: Sequence[int], residual: Array) -> FreeScan:
-    """Scan a free kick (px, py) in every active shot, in the middle of each layer's magnet."""
+    """Scan a free kick (px, py) in every shot, in the middle of each layer's magnet."""
     clean = metric.projection.out(residual)
     return free_scan(*metric.free_kicks(np.asarray(layers), clean))
 
 
 def scan_monitors(metric: Metric, residual: Array) -> FreeScan:
-    """Scan monitors with free readings in every active shot and turn."""
+    """Scan monitors with free readings in every shot and turn."""
     return free_scan(*metric.free_monitors(metric.projection.out(residual)))

@@ -1,18 +1,21 @@
 """Reduction of the gap between model and measurement on held-out readings.
 
-explained = 1 - (r_after^2 - v) / (r_before^2 - v), where v is the variance of the residuals by the
-readings' noise, refitted nuisances included. Its interval is that of the same noise.
+explained = 1 - (r_after^2 - v) / (r_before^2 - v), where r are residuals in units of the noise, and
+v is their variance by it, refitted nuisances included. Its interval is that of the same noise.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from tmlattice.arrays import TINY, Array
+from tmlattice.arrays import Array
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import SIGNIFICANT
+from tmlattice.inference.newton import fit_nuisances
+from tmlattice.inference.problem import Problem
+from tmlattice.inference.whitening import ROUNDING
 
 
 @dataclass(frozen=True)
@@ -33,73 +36,113 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of held-out readings, some of them correlated.
+    """Residuals of held-out readings, some of them correlated, in units of their noise.
 
     Attributes:
-        residual: readings less model, [reading], m.
-        noise: their covariance by the readings' noise, [reading, reading], m^2.
-        covariance: the same with the model's uncertainty; None: no uncertainty.
+        residual: readings less model, [reading].
+        noise: of the readings, m, [reading].
+        spread: root of their covariance by the refitted nuisances, [reading, nuisance].
+        unknown: their covariance by the model's uncertainty, [reading, reading]; None: none.
     """
 
     residual: Array
     noise: Array
-    covariance: Array | None = None
+    spread: Array
+    unknown: Array | None = None
 
 
 @dataclass(frozen=True)
 class Half:
-    """Readings of one half of the monitors.
+    """Rows of one half of the monitors, in units of their noise.
 
     Attributes:
-        left: readings less model, [reading], m.
-        slopes: d reading / d nuisance, [reading, nuisance].
-        sigma: noise, [reading], m.
+        left: readings less model, [row].
+        slopes: d row / d nuisance, [row, nuisance].
+        model: d row / d error of the model, of size 1, [error, row]; or without any.
     """
 
     left: Array
     slopes: Array
-    sigma: Array
+    model: Array
 
 
-def cross_predicted(
-    fitted: Half, scored: Half, offset: Array, known: Array, unknown: Array | None = None
-) -> Residuals:
+def cross_predicted(fitted: Half, scored: Half, noise: Array, known: int = 0) -> Residuals:
     """Residuals of one half of the monitors with nuisances fitted to the other half.
 
     Args:
-        fitted, scored: the halves.
-        offset: prior mean of the nuisances less the model's values, [nuisance].
-        known: prior precision of the nuisances, [nuisance]; 0: none.
-        unknown: covariance of the readings by the model's uncertainty, the fitted half first,
-            [reading, reading], m^2; None: none.
+        fitted: one half, with what is known of the nuisances before.
+        scored: the other half.
+        noise: of its readings, m, [row].
+        known: the last errors of the model, so many of them, do not add to its covariance but were
+            removed from it, by the readings of the fit.
     """
     # weighted by the noise alone: nuisances also absorb model errors near these readings
-    weighed = fitted.slopes / fitted.sigma[:, None] ** 2
-    information = fitted.slopes.T @ weighed + np.diag(known)
-    size = np.sqrt(np.maximum(np.diagonal(information), TINY))
-    inverse = np.linalg.pinv(information / size[:, None] / size) / size[:, None] / size
-    gain = inverse @ weighed.T  # nuisance per reading
-    moved = gain @ fitted.left + inverse @ (known * offset)
-    errors = (gain * fitted.sigma**2) @ gain.T + (inverse * known) @ inverse
-    noise = np.diag(scored.sigma**2) + scored.slopes @ errors @ scored.slopes.T
-    whole = None
-    if unknown is not None:
-        takes = np.hstack([-scored.slopes @ gain, np.eye(len(scored.left))])
-        whole = noise + takes @ unknown @ takes.T
-    return Residuals(scored.left - scored.slopes @ moved, noise, whole)
+    size = np.linalg.norm(fitted.slopes, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    into, values, vectors = np.linalg.svd(fitted.slopes / size, full_matrices=False)
+    kept = values > ROUNDING * max(fitted.slopes.shape)
+    into = into[:, kept]
+    spread = scored.slopes @ (vectors[kept].T / values[kept] / size[:, None])
+
+    def beyond(own: Array, others: Array) -> Array:
+        """Rows of the scored half without the nuisances of the fitted half."""
+        return np.asarray(own - (others @ into) @ spread.T)
+
+    unknown = None
+    if len(scored.model):
+        rows = beyond(scored.model, fitted.model)
+        there, removed = rows[: len(rows) - known], rows[len(rows) - known :]
+        unknown = there.T @ there - removed.T @ removed
+    return Residuals(beyond(scored.left, fitted.left), noise, spread, unknown)
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """All held-out readings of one model.
+def predicted(
+    problem: Problem, errors: Array | None = None, known: int = 0
+) -> tuple[tuple[Residuals, ...], Array]:
+    """Residuals of a validation set. Its own nuisances are fitted to every second BPM, and the
+    readings of the others are predicted; all readings, if it has none.
 
-    Attributes:
-        residuals: readings less model, NaN where not scored, [shot, reading, 2], m.
-        parts: scored residuals in uncorrelated groups; empty where the model has no solution.
+    Args:
+        problem: of these readings; its `fixed` causes are the model's.
+        errors: d reading / d error of the model, of size 1, m, [error, *shape of `valid`]; None: no
+            uncertainty.
+        known: see `cross_predicted`.
+
+    Returns:
+        The residuals, none where the model has no solution; and readings less model, NaN where not
+            scored, m, of the shape of `valid`.
     """
-
-    residuals: Array
-    parts: tuple[Residuals, ...]
+    owner = problem.owner()  # -1: tunes, and what is known before
+    residuals = np.full(problem.valid.shape, np.nan)
+    reading = np.unique(owner[problem.valid & (owner >= 0)])
+    odd = (owner >= 0) & (np.searchsorted(reading, owner) % 2 == 1)
+    scored = problem.valid & (odd if problem.free else owner >= 0)
+    other = problem.without(odd)
+    try:
+        fitted = fit_nuisances(other, (), other.first)
+        point = problem.at((), fitted.nuisances)
+    except UnstableRingError:
+        return (), residuals
+    if fitted.projection is None or point.projection is None or not scored.any():
+        return (), residuals
+    unit = problem.as_rows(scored.astype(float))
+    own = unit > 0
+    model = np.zeros((0, *problem.valid.shape)) if errors is None else errors
+    before, behind = other.as_rows(model), problem.as_rows(model)
+    found = []
+    for (there, slopes), (here, others) in zip(
+        fitted.projection.blocks(errors is not None), point.projection.blocks(errors is not None),
+        strict=True,
+    ):  # fmt: skip
+        mine = own[here]
+        if mine.any():
+            found.append(cross_predicted(
+                Half(fitted.residual[there], slopes, before[:, there]),
+                Half(point.residual[here][mine], others[mine], behind[:, here][:, mine]),
+                1 / unit[here][mine], known,
+            ))  # fmt: skip
+    residuals[scored] = np.concatenate([one.residual * one.noise for one in found])
+    return tuple(found), residuals
 
 
 CLOSED = 0.1
@@ -113,7 +156,8 @@ class Gap:
 
     Attributes:
         misfits: of each model, in the order of the arguments.
-        residuals: readings less model, NaN where not scored, [model, shot, reading, 2], m.
+        residuals: readings less model, NaN where not scored, m, [model, *shape of the readings];
+            of several measurements flat.
         explained: share of the gap of model `baseline` that the last model explains; None if that
             is the last one itself, or its gap is within the noise.
         interval: of `explained`, 95 %.
@@ -145,19 +189,23 @@ class Gap:
         return self.interval is not None and self.interval[1] < CLOSED
 
 
-def held_out_gap(models: Sequence[HeldOut], baseline: int = 0) -> Gap:
+def held_out_gap(
+    models: Sequence[Sequence[Residuals]], baseline: int = 0, residuals: Array | None = None
+) -> Gap:
     """Return the gap of a series of models on held-out readings.
 
     Args:
-        models: the first is the design.
+        models: uncorrelated groups of residuals of each, none where it has no solution; the first
+            is the design.
         baseline: index of the model with which the last one is compared.
+        residuals: see `Gap`.
     """
-    misfits = tuple(_misfit(model.parts) for model in models)
     explained, interval = None, None
-    if baseline < len(models) - 1 and models[baseline].parts and models[-1].parts:
-        explained, interval = _explained(models[baseline].parts, models[-1].parts)
-    residuals = np.array([model.residuals for model in models])
-    readings, last = (int(np.isfinite(residuals[i]).sum()) for i in (baseline, -1))
+    if baseline < len(models) - 1 and models[baseline] and models[-1]:
+        explained, interval = _explained(models[baseline], models[-1])
+    readings, last = (sum(len(own.residual) for own in models[i]) for i in (baseline, -1))
+    residuals = np.zeros((len(models), 0)) if residuals is None else residuals
+    misfits = tuple(map(_misfit, models))
     return Gap(misfits, residuals, explained, interval, baseline, readings, readings != last)
 
 
@@ -167,10 +215,17 @@ def _misfit(parts: Sequence[Residuals]) -> Misfit:
         return Misfit(np.nan, np.nan)
     square = weighed = expected = 0.0
     for part in parts:
-        covariance = part.noise if part.covariance is None else part.covariance
-        square += float(part.residual @ part.residual)
-        weighed += float(part.residual @ np.linalg.solve(covariance, part.residual))
-        expected += float(np.trace(covariance))
+        square += float(np.sum((part.residual * part.noise) ** 2))
+        variance = 1 + np.sum(part.spread**2, axis=1)
+        if part.unknown is None:  # by Woodbury
+            inside = np.eye(part.spread.shape[1]) + part.spread.T @ part.spread
+            along = part.residual @ part.spread
+            weighed += float(part.residual @ part.residual - along @ np.linalg.solve(inside, along))
+        else:
+            covariance = np.eye(len(variance)) + part.spread @ part.spread.T + part.unknown
+            weighed += float(part.residual @ np.linalg.solve(covariance, part.residual))
+            variance = np.diag(covariance)
+        expected += float(variance @ part.noise**2)
     return Misfit(float(np.sqrt(square / count)), weighed / count, float(np.sqrt(expected / count)))
 
 
@@ -182,15 +237,27 @@ def _explained(
     one, other = (np.concatenate([part.residual for part in parts]) for parts in (before, after))
     if len(one) != len(other):
         return None, None  # the beam is lost in one of them
-    V_one, V = (block_diag(*(part.noise for part in parts)) for parts in (before, after))
-    twice = float(np.vdot(V, V))
-    moved_one, moved_other = V @ one, V @ other
-    bottom = float(one @ one - np.trace(V_one))
-    top = float(other @ other - np.trace(V))
+    trace_one, trace = (
+        len(one) + sum(float(np.sum(part.spread**2)) for part in parts) for parts in (before, after)
+    )
+    inside = [part.spread.T @ part.spread for part in after]
+    twice = len(one) + sum(float(2 * np.trace(own) + np.sum(own**2)) for own in inside)
+    ends = np.cumsum([len(part.residual) for part in after])[:-1]
+
+    def product(x: Array, y: Array) -> float:
+        """In the covariance of the noise."""
+        along = (
+            (a @ part.spread) @ (b @ part.spread)
+            for a, b, part in zip(np.split(x, ends), np.split(y, ends), after, strict=True)
+        )
+        return float(x @ y + sum(along))
+
+    bottom = float(one @ one) - trace_one
+    top = float(other @ other) - trace
     # variances of the noise-free squares; the noise's own part is subtracted
-    spread_bottom = 2 * twice + 4 * max(float(one @ moved_one) - twice, 0.0)
-    spread_top = 2 * twice + 4 * max(float(other @ moved_other) - twice, 0.0)
-    shared = 2 * twice + 4 * (float(one @ moved_other) - twice)
+    spread_bottom = 2 * twice + 4 * max(product(one, one) - twice, 0.0)
+    spread_top = 2 * twice + 4 * max(product(other, other) - twice, 0.0)
+    shared = 2 * twice + 4 * (product(one, other) - twice)
     if bottom < SIGNIFICANT * np.sqrt(spread_bottom):
         return None, None
     left = max(top, 0.0) / bottom

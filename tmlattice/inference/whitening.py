@@ -9,7 +9,6 @@ symmetric root in the space of the errors: with S S^T = U L U^T
 which costs errors^2 x rows once and errors x rows for each row that is whitened.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -25,79 +24,71 @@ SMALLEST_SHARE = 1e-12
 """Share of the largest variance below which a variance is rounding."""
 
 
-class Root(ABC):
-    """Matrix W with W^T W = (1 + S^T S)^-1."""
+@dataclass(frozen=True)
+class Triangle:
+    """Matrix W with W^T W = (1 + S^T S)^-1: the inverse of the Cholesky factor.
 
-    @abstractmethod
+    Attributes:
+        matrix: W, [row, row].
+    """
+
+    matrix: Array
+
     def white(self, rows: Array) -> Array:
         """Rows [..., row] times W^T."""
+        return np.asarray(rows @ self.matrix.T)
 
-    @abstractmethod
     def back(self, rows: Array) -> Array:
         """Rows [..., row] times W."""
+        return np.asarray(rows @ self.matrix)
 
     @property
-    @abstractmethod
-    def matrix(self) -> Array:
-        """W itself, [row, row]."""
-
-    @property
-    @abstractmethod
     def information(self) -> Array:
         """Diagonal of W^T W: inverse variance of each row given all others, [row]."""
+        return np.asarray((self.matrix**2).sum(axis=0))
 
     @property
-    @abstractmethod
     def log_scale(self) -> float:
         """Logarithm of the determinant of W."""
+        return float(np.log(np.diagonal(self.matrix)).sum())
 
 
 @dataclass(frozen=True)
-class _Triangle(Root):
-    inverse: Array  # of the Cholesky factor, [row, row]
+class Symmetric:
+    """The same as `Triangle` by a symmetric W, which is not formed.
+
+    Attributes:
+        directions: orthonormal, [direction, row].
+        size: factor of W along them, [direction].
+    """
+
+    directions: Array
+    size: Array
 
     def white(self, rows: Array) -> Array:
-        return np.asarray(rows @ self.inverse.T)
-
-    def back(self, rows: Array) -> Array:
-        return np.asarray(rows @ self.inverse)
-
-    @property
-    def matrix(self) -> Array:
-        return self.inverse
-
-    @property
-    def information(self) -> Array:
-        return np.asarray((self.inverse**2).sum(axis=0))
-
-    @property
-    def log_scale(self) -> float:
-        return float(np.log(np.diagonal(self.inverse)).sum())
-
-
-@dataclass(frozen=True)
-class _Symmetric(Root):
-    directions: Array  # orthonormal, [direction, row]
-    size: Array  # along them, [direction]
-
-    def white(self, rows: Array) -> Array:
+        """Rows [..., row] times W^T."""
         along = (rows @ self.directions.T) * (self.size - 1)
         return np.asarray(rows + along @ self.directions)
 
-    def back(self, rows: Array) -> Array:
-        return self.white(rows)
+    back = white
 
     @property
     def matrix(self) -> Array:
+        """W, [row, row]."""
         return self.white(np.eye(self.directions.shape[1]))
 
     @property
     def information(self) -> Array:
+        """Diagonal of W^T W, [row]."""
         return np.asarray(1 - (1 - self.size**2) @ self.directions**2)
 
     @property
     def log_scale(self) -> float:
+        """Logarithm of the determinant of W."""
         return float(np.log(self.size).sum())
+
+
+Root = Triangle | Symmetric
 
 
 def inverse_root(spread: Array) -> Root:
@@ -110,9 +101,9 @@ def inverse_root(spread: Array) -> Root:
     if errors >= rows:
         covariance = spread.T @ spread
         covariance[np.diag_indices(rows)] += 1.0
-        return _Triangle(inverse_of_lower(lower_factor(covariance)))
+        return Triangle(inverse_of_lower(lower_factor(covariance)))
     values, directions = directions_of(spread)
-    return _Symmetric(directions, 1 / np.sqrt(1 + values))
+    return Symmetric(directions, 1 / np.sqrt(1 + values))
 
 
 def directions_of(spread: Array) -> tuple[Array, Array]:
@@ -148,7 +139,8 @@ class Projection:
         self.Q, R = np.linalg.qr(directions)
         seen = np.abs(np.diagonal(R, axis1=1, axis2=2))  # [block, column]
         size = np.linalg.norm(directions, axis=1)
-        if (seen <= ROUNDING * size).any():  # QR would give an arbitrary direction
+        few = directions.shape[1] < directions.shape[2]
+        if few or (seen <= ROUNDING * size).any():  # QR would give an arbitrary direction
             scale = np.where(size > 0, size, 1.0)[:, None]
             U, s, V = np.linalg.svd(directions / scale, full_matrices=False)
             kept = s > ROUNDING * max(directions.shape[1:])
@@ -180,6 +172,13 @@ class Projection:
     def matrix(self) -> Array:
         """Directions of all blocks, [row, coordinate]."""
         return np.asarray(block_diag(*(Q @ R for Q, R in self._blocks)))
+
+    def blocks(self, together: bool = False) -> Iterator[tuple[slice, Array]]:
+        """Yield rows, and directions there [row, coordinate], of each block, or of all together."""
+        end = 0
+        for own in (self.matrix(),) if together else (Q @ R for Q, R in self._blocks):
+            yield slice(end, end + len(own)), own
+            end += len(own)
 
     def inside(self, rows: Array) -> Array:
         """Square of the part of rows [..., row] that launches explain, [...]."""

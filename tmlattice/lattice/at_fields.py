@@ -119,15 +119,10 @@ def thin(
 
 
 def _combined(strengths: Any, length: float, roll: float, family: str) -> Any:
-    from tmlattice.lattice.combined import CombinedMultipole
+    from tmlattice.lattice.combined import CombinedMultipole, fields_of
 
     k = [complex(strength) * math.factorial(n) for n, strength in enumerate(strengths[:3])]
-    return CombinedMultipole(
-        l=length,
-        k0=k[0].real, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real, k2s=k[2].imag,
-        tilt=roll,
-        eid=family,
-    )  # fmt: skip
+    return CombinedMultipole(l=length, tilt=roll, eid=family, **fields_of(k))
 
 
 def own_order(element: Any, mad: str) -> int | None:

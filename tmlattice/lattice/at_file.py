@@ -19,9 +19,10 @@ tau = ct, p = beta0 delta.
 import cmath
 import logging
 import math
+import pickle
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -159,28 +160,37 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     design = Ring(name, (), energy_gev, mass=ELECTRON_GEV if light else rest)
     report = Report()
     converted: list[Place] = []
-    known: dict[int, list[Place]] = {}
+    known: dict[Hashable, tuple[list[Place], str, list[str]]] = {}  # with family and what it lacks
     errors: dict[int, dict[str, float]] = {}
     still = {id(element): _at_rest(element) for element in lattice}
     check_methods(still.values())
+    content = {id(element): _content(element) for element in still.values()}
     for element in (still[id(element)] for element in lattice):
-        if id(element) not in known:
+        if (key := content[id(element)]) not in known:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
             entrance, exit_ = _frame(element, family, design.map_energy)
             bare = _without(element, "T1", "T2", "R1", "R2") if entrance else element
-
-            def left_out(reason: str, family: str = family, own: int = id(element)) -> None:
-                report.left_out(reason, family, own)
-
-            own = _places(bare, family, design.map_energy, left_out)
+            lacks: list[str] = []
+            own = _places(bare, family, design.map_energy, lacks.append)
             if shift := _shift(bare):
                 errors |= {id(source): shift for _, _, source in own}
-            known[id(element)] = [*entrance, *own, *exit_]
-        converted += known[id(element)]
+            known[key] = [*entrance, *own, *exit_], family, lacks
+        places, family, lacks = known[key]
+        for reason in lacks:
+            report.left_out(reason, family, id(element))
+        converted += places
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     report.warn(name)
     return assembled(design, converted, errors, max(1, int(lattice.periodicity)))
+
+
+def _content(element: Any) -> Hashable:
+    """A key that elements with equal fields share: files have most elements many times."""
+    try:
+        return pickle.dumps((type(element), vars(element)))
+    except Exception:  # a field that is no data
+        return id(element)
 
 
 def _at_rest(element: Any) -> Any:
@@ -217,6 +227,8 @@ def _rotations(element: Any) -> tuple[Array, Array]:
 
 def _roll(element: Any) -> float:
     """rad."""
+    if not hasattr(element, "R1"):
+        return 0.0
     R1, _ = _rotations(element)
     return math.atan2(R1[0, 2], R1[0, 0])
 
@@ -224,6 +236,8 @@ def _roll(element: Any) -> float:
 def _frame(element: Any, family: str, energy: float) -> tuple[list[Place], list[Place]]:
     """What T1, R1 and R2, T2 do before and behind an element, where they are neither an offset nor
     a roll: matrices of their own. x -> R1 (x + T1) and x -> R2 x + T2."""
+    if vars(element).keys().isdisjoint(("T1", "T2", "R1", "R2")):
+        return [], []
     (T1, T2), (R1, R2) = _translations(element), _rotations(element)
     turn = rotation(_roll(element))
     offset = np.array_equal(T1, -T2) and not T1[[1, 3, 4, 5]].any()

@@ -276,21 +276,11 @@ class _Budget:
         return _texts(value, name) if h5py.check_string_dtype(item.dtype) else value
 
     def attribute(self, item: Any, name: str) -> Any:
-        """A number, a text or a list; None where there is none."""
-        if name not in item.attrs:
-            return None
-        return self._attribute(item, name)
-
-    def attributes(self, item: Any) -> dict[str, Any]:
-        """All attributes that are numbers or texts."""
-        if len(item.attrs) > MOST_ATTRIBUTES:
-            raise RefusedError(f"'{item.name}' has more than {MOST_ATTRIBUTES:,} attributes")
-        found = {name: self._attribute(item, name) for name in item.attrs}
-        return {name: value for name, value in found.items() if value is not None}
-
-    def _attribute(self, item: Any, name: str) -> Any:
+        """A number, a text or a list; None where there is none, or something else."""
         import h5py
 
+        if name not in item.attrs:
+            return None
         stated = item.attrs.get_id(name)
         kind = stated.dtype
         if not (kind.kind in "fiub" or h5py.check_string_dtype(kind)) or stated.shape is None:
@@ -301,6 +291,13 @@ class _Budget:
         if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
             return value if value.size > 1 else value.ravel()[0] if value.size else None
         return _texts(value, name) if not isinstance(value, np.number | np.bool_) else value
+
+    def attributes(self, item: Any) -> dict[str, Any]:
+        """All attributes that are numbers or texts."""
+        if len(item.attrs) > MOST_ATTRIBUTES:
+            raise RefusedError(f"'{item.name}' has more than {MOST_ATTRIBUTES:,} attributes")
+        found = {name: self.attribute(item, name) for name in item.attrs}
+        return {name: value for name, value in found.items() if value is not None}
 
 
 def _identity(item: Any) -> Any:

@@ -143,10 +143,13 @@ class CombinedMultipole(OpticElement):  # type: ignore[misc]
 
     Args:
         l: length, m; 0: the fields are integrated.
-        k0, k0s, k1, k1s, k2, k2s: see `FIELDS`.
-        angle, lrad: see `DESIGN`; only of a thin one.
         tilt: of all fields about the beam axis, rad.
         eid: its name.
+        **fields: k0, k0s, k1, k1s, k2, k2s, see `FIELDS`; of a thin one angle and lrad, see
+            `DESIGN`; 0 where not given.
+
+    Raises:
+        TypeError: another field.
     """
 
     supported_tms = frozenset({elements.Quadrupole.default_tm, SecondTM})
@@ -155,19 +158,17 @@ class CombinedMultipole(OpticElement):  # type: ignore[misc]
         self,
         l: float = 0.0,  # noqa: E741
         *,
-        k0: float = 0.0,
-        k0s: float = 0.0,
-        k1: float = 0.0,
-        k1s: float = 0.0,
-        k2: float = 0.0,
-        k2s: float = 0.0,
-        angle: float = 0.0,
-        lrad: float = 0.0,
         tilt: float = 0.0,
         eid: Any = None,
         tm: Any = None,
+        **fields: float,
     ) -> None:
-        atom = CombinedAtom(
-            l, tilt, eid, k0=k0, k0s=k0s, k1=k1, k1s=k1s, k2=k2, k2s=k2s, angle=angle, lrad=lrad
-        )
-        super().__init__(atom, tm=tm)
+        if unknown := fields.keys() - {*FIELDS, *DESIGN}:
+            raise TypeError(f"a CombinedMultipole has no {', '.join(sorted(unknown))}")
+        super().__init__(CombinedAtom(l, tilt, eid, **fields), tm=tm)
+
+
+def fields_of(strengths: Any) -> dict[str, float]:
+    """`FIELDS` of k_n + i k_ns, [order], three at least; higher ones are passed over."""
+    pairs = np.asarray(strengths[:3], dtype=complex).view(float)
+    return dict(zip(FIELDS, pairs.tolist(), strict=True))

@@ -8,6 +8,7 @@ Nothing of a file is run: RPN is worked out by `_Rpn`, which knows numbers, name
 """
 
 import math
+import operator
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -170,66 +171,55 @@ def read_elegant(
 
 
 # --- RPN ------------------------------------------------------------------------------------------
-def _unary(function: Callable[[float], float]) -> tuple[int, Callable[..., tuple[float, ...]]]:
-    return 1, lambda a: (function(a),)
-
-
-def _binary(
-    function: Callable[[float, float], float],
-) -> tuple[int, Callable[..., tuple[float, ...]]]:
-    return 2, lambda a, b: (function(a, b),)
-
-
-def _of_degrees(function: Callable[[float], float]) -> Callable[[float], float]:
-    return lambda angle: function(math.radians(angle))
-
-
-def _to_degrees(function: Callable[[float], float]) -> Callable[[float], float]:
-    return lambda value: math.degrees(function(value))
-
-
-_OPERATORS: dict[str, tuple[int, Callable[..., tuple[float, ...]]]] = {
-    "+": _binary(lambda a, b: a + b),
-    "-": _binary(lambda a, b: a - b),
-    "*": _binary(lambda a, b: a * b),
-    "/": _binary(lambda a, b: a / b),
-    "pow": _binary(math.pow),
-    "mod": _binary(math.fmod),
-    "atan2": _binary(lambda a, b: math.atan2(b, a)),
-    "hypot": _binary(math.hypot),
-    "max2": _binary(max),
-    "min2": _binary(min),
-    "sqr": _unary(lambda a: a * a),
-    "sqrt": _unary(math.sqrt),
-    "exp": _unary(math.exp),
-    "ln": _unary(math.log),
-    "log": _unary(math.log10),
-    "abs": _unary(abs),
-    "int": _unary(math.trunc),
-    "floor": _unary(math.floor),
-    "ceil": _unary(math.ceil),
-    "chs": _unary(lambda a: -a),
-    "rec": _unary(lambda a: 1 / a),
-    "erf": _unary(math.erf),
-    "erfc": _unary(math.erfc),
-    "lngam": _unary(math.lgamma),
-    "dtor": _unary(math.radians),
-    "rtod": _unary(math.degrees),
-    "beta.p": _unary(lambda p: p / math.hypot(1, p)),
-    "gamma.p": _unary(lambda p: math.hypot(1, p)),
-    "p.gamma": _unary(lambda g: math.sqrt(g * g - 1)),
-    "gamma.beta": _unary(lambda b: 1 / math.sqrt(1 - b * b)),
-    "=": (1, lambda a: (a, a)),
-    "dup": (1, lambda a: (a, a)),
-    "swap": (2, lambda a, b: (b, a)),
-    "over": (2, lambda a, b: (a, b, a)),
-    "pop": (1, lambda a: ()),
-    **{n: _unary(getattr(math, n)) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh",
-                                             "cosh", "tanh", "asinh", "acosh", "atanh")},
-    **{f"d{n}": _unary(_of_degrees(getattr(math, n))) for n in ("sin", "cos", "tan")},
-    **{f"d{n}": _unary(_to_degrees(getattr(math, n))) for n in ("asin", "acos", "atan")},
+_OF_ONE: dict[str, Callable[..., Any]] = {
+    "sqr": lambda a: a * a,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "ln": math.log,
+    "log": math.log10,
+    "abs": abs,
+    "int": math.trunc,
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "chs": lambda a: -a,
+    "rec": lambda a: 1 / a,
+    "erf": math.erf,
+    "erfc": math.erfc,
+    "lngam": math.lgamma,
+    "dtor": math.radians,
+    "rtod": math.degrees,
+    "beta.p": lambda p: p / math.hypot(1, p),
+    "gamma.p": lambda p: math.hypot(1, p),
+    "p.gamma": lambda g: math.sqrt(g * g - 1),
+    "gamma.beta": lambda b: 1 / math.sqrt(1 - b * b),
+    "dsin": lambda a: math.sin(math.radians(a)),
+    "dcos": lambda a: math.cos(math.radians(a)),
+    "dtan": lambda a: math.tan(math.radians(a)),
+    "dasin": lambda a: math.degrees(math.asin(a)),
+    "dacos": lambda a: math.degrees(math.acos(a)),
+    "datan": lambda a: math.degrees(math.atan(a)),
+    **{n: getattr(math, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh",
+                                     "cosh", "tanh", "asinh", "acosh", "atanh")},
+    "=": lambda a: (a, a),
+    "dup": lambda a: (a, a),
+    "pop": lambda a: (),
 }  # fmt: skip
-"""How many numbers an operator takes from the stack, the last on top, and what it leaves there."""
+_OF_TWO: dict[str, Callable[..., Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "pow": math.pow,
+    "mod": math.fmod,
+    "atan2": lambda a, b: math.atan2(b, a),
+    "hypot": math.hypot,
+    "max2": max,
+    "min2": min,
+    "swap": lambda a, b: (b, a),
+    "over": lambda a, b: (a, b, a),
+}
+"""What an operator leaves on the stack of the number, or the two, that it takes from there: a
+number, or several of which the last is on top."""
 _CONSTANTS = {"pi": math.pi, "log_10": math.log(10), "HUGE": 1e308, "on_div_by_zero": 0.0,
               "c_mks": LIGHT, "c_cgs": 100 * LIGHT, "e_mks": 1.602176634e-19,
               "me_mks": 9.1093837015e-31, "me_cgs": 9.1093837015e-28, "mev": 0.51099895,
@@ -268,20 +258,21 @@ class _Rpn:
                 stack.append(float(word))
             elif word in self.memory:
                 stack.append(self.memory[word])
-            elif word.lower() in _OPERATORS:
+            elif word.lower() in _OF_ONE or word.lower() in _OF_TWO:
                 self._operate(word.lower(), stack)
             else:
                 stack.append(self._named(word))
         return stack[-1] if stack else None
 
     def _operate(self, word: str, stack: list[float]) -> None:
-        count, operate = _OPERATORS[word]
+        count, operate = (1, _OF_ONE[word]) if word in _OF_ONE else (2, _OF_TWO[word])
         if len(stack) < count:
             raise LatticeError(f"'{word}' needs {count} numbers before it")
         taken = stack[-count:]
         del stack[-count:]
         try:
-            stack.extend(float(number) for number in operate(*taken))
+            made = operate(*taken)
+            stack.extend(map(float, made if isinstance(made, tuple) else (made,)))
         except (ArithmeticError, ValueError) as error:
             numbers = " ".join(f"{n:g}" for n in taken)
             raise LatticeError(f"'{numbers} {word}' has no value") from error

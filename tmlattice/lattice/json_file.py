@@ -100,12 +100,15 @@ def package_of(path: Path) -> str:
     )
 
 
-def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
+def read_json(
+    path: Path, name: str, sequence: str | None = None, energy: float | None = None
+) -> Ring:
     """The ring of a file that `save_json` wrote.
 
     Args:
         path: of the file.
         name: of the ring.
+        sequence: passed over; a file is one ring.
         energy: GeV; else the file's.
 
     Raises:

@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ from tmlattice.lattice.checks import check_ring, reading
 from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import PARTICLES, Ring
 
-MADX_SUFFIXES = (".seq", ".madx", ".lte")
 TFS_SUFFIXES = (".tfs", ".twiss", ".dat", ".outx")
-SUFFIXES = (".py", ".json", ".mat", ".m", ".repr", *MADX_SUFFIXES, *TFS_SUFFIXES)
+SUFFIXES = (".py", ".json", ".mat", ".m", ".repr", ".seq", ".madx", ".lte", *TFS_SUFFIXES)
 """Of lattice files."""
 
 
@@ -121,37 +121,25 @@ def _checked(where: Path, read: Callable[[], Ring]) -> tuple[Ring, bool]:
     return ring, bool(own)
 
 
+_READERS = {
+    ".py": "ocelot_file.read_ocelot", ".lte": "elegant_file.read_elegant",
+    ".seq": "madx_file.read_madx", ".madx": "madx_file.read_madx",
+    **dict.fromkeys(TFS_SUFFIXES, "tfs_file.read_tfs"),
+    "tmlattice": "json_file.read_json", "xsuite": "xsuite_file.read_xsuite",
+}  # fmt: skip
+"""Modules and functions by suffix, or by the package that wrote a JSON file; others are AT's."""
+
+
 def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> Ring:
-    suffix = path.suffix.lower()
-    if suffix == ".py":
-        from tmlattice.lattice.ocelot_file import read_ocelot
+    kind = path.suffix.lower()
+    if kind == ".json":
+        from tmlattice.lattice.json_file import package_of
 
-        return read_ocelot(path, name, sequence, energy)
-    if suffix == ".json":
-        from tmlattice.lattice.json_file import package_of, read_json
-
-        package = package_of(path)
-        if package == "xsuite":
-            from tmlattice.lattice.xsuite_file import read_xsuite
-
-            return read_xsuite(path, name, sequence, energy)
-        if package == "tmlattice":
-            return read_json(path, name, energy)
-    if suffix == ".lte":
-        from tmlattice.lattice.elegant_file import read_elegant
-
-        return read_elegant(path, name, sequence, energy)
-    if suffix in MADX_SUFFIXES:
-        from tmlattice.lattice.madx_file import read_madx
-
-        return read_madx(path, name, sequence, energy)
-    if suffix in TFS_SUFFIXES:
-        from tmlattice.lattice.tfs_file import read_tfs
-
-        return read_tfs(path, name, energy)
-    from tmlattice.lattice.at_file import read_at
-
-    return read_at(path, name, sequence, energy)
+        kind = package_of(path)
+    module, _, function = _READERS.get(kind, "at_file.read_at").partition(".")
+    read = getattr(import_module(f"tmlattice.lattice.{module}"), function)
+    ring: Ring = read(path, name, sequence, energy)
+    return ring
 
 
 _FOREIGN = {

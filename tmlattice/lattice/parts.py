@@ -412,7 +412,7 @@ def _thin(part: Part, report: Report) -> Any:
 
     `angle`, where it is given, is the design's bend, and the rest of KNL[0] a field error.
     """
-    from tmlattice.lattice.combined import CombinedMultipole
+    from tmlattice.lattice.combined import CombinedMultipole, fields_of
 
     own = fields(part)
     if np.any(own[3:]):
@@ -426,12 +426,11 @@ def _thin(part: Part, report: Report) -> Any:
     angle = k[0].real if given is None else float(given)
     if angle and (k[1] or k[2]):
         report.left_out("products of curvature and gradient", part.name)
+    k[0] -= angle
+    tilt = part.number("tilt") + turn
     return CombinedMultipole(
-        k0=k[0].real - angle, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real,
-        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"),
-        tilt=part.number("tilt") + turn,
-        eid=part.name,
-    )  # fmt: skip
+        **fields_of(k), angle=angle, lrad=part.number("lrad"), tilt=tilt, eid=part.name
+    )
 
 
 def _bend(part: Part, report: Report) -> Any:

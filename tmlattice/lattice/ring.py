@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from tmlattice.errors import LatticeError, first_of, unknown_name
 from tmlattice.late import Method
-from tmlattice.lattice.alike import Supplies, alike_by_design
+from tmlattice.lattice.slices import Supplies, alike_by_design, slices_of
 from tmlattice.speaks import Speaks, last_part
 
 Kind = Literal[
@@ -75,7 +75,7 @@ class Errors:
 
     def plus(self, **amounts: float | Slopes) -> "Errors":
         """These errors and more of the named ones."""
-        return _copy(self, **{n: _sum(getattr(self, n), a) for n, a in amounts.items()})
+        return _copy(self, **{n: summed(getattr(self, n), a) for n, a in amounts.items()})
 
 
 def _copy(one: Made, **changed: Any) -> Made:
@@ -86,7 +86,8 @@ def _copy(one: Made, **changed: Any) -> Made:
     return other
 
 
-def _sum(old: Any, more: Any) -> Any:
+def summed(old: Any, more: Any) -> Any:
+    """The sum of two amounts of an error, or of each of its slopes."""
     if isinstance(old, tuple):
         return tuple(a + b for a, b in zip(old, more, strict=True))
     return old + more
@@ -403,8 +404,6 @@ class Ring(Speaks):
     def slices(self) -> dict[int, tuple[int, ...]]:
         """Magnets that stand in pieces: the place of the longest, and those of all; see
         `lattice.slices`."""
-        from tmlattice.lattice.slices import slices_of
-
         return slices_of(self.elements)
 
     @cached_property
@@ -415,7 +414,7 @@ class Ring(Speaks):
     @cached_property
     def supplies(self) -> Supplies:
         """Quadrupoles that share no name with others and are alike in the design, see
-        `lattice.alike`."""
+        `lattice.slices`."""
         if self.known_supplies is not None:
             return self.known_supplies
         return alike_by_design(self.elements, self.whole)

@@ -9,8 +9,8 @@ from collections.abc import Collection
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.lattice.alike import bodies, families
 from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.slices import bodies, families
 
 
 def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:

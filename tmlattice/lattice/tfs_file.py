@@ -41,12 +41,15 @@ _NUMERIC = frozenset({
 Row = dict[str, Any]
 
 
-def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
+def read_tfs(
+    path: Path, name: str, sequence: str | None = None, energy: float | None = None
+) -> Ring:
     """The ring of a table of MAD-X.
 
     Args:
         path: of the file.
         name: of the ring.
+        sequence: passed over; a table is one ring.
         energy: GeV; else that of the header, by its ENERGY, PC or GAMMA.
 
     Raises:

@@ -10,12 +10,12 @@ from scipy.constants import physical_constants
 from scipy.linalg import sqrtm
 
 from tmlattice.arrays import Array
-from tmlattice.effects.build import Build, Where
+from tmlattice.effects.build import Build
 from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.combined import bend_matrix
 from tmlattice.lattice.places import rotation
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.ring import Element, Ring, Slopes
 
 ELECTRON = physical_constants["electron mass energy equivalent in MeV"][0] * 1e6  # eV
 RADIUS = physical_constants["classical electron radius"][0]  # m
@@ -126,28 +126,16 @@ def errors_of(element: Element, energy: float) -> Build:
     errors = element.errors
     if element.kind == "bend" and errors.roll:
         raise LatticeError(f"AT cannot build the bend '{element.name}' with a roll of its own")
-    own = Build(
-        dx=errors.dx, dy=errors.dy, ds=errors.ds, roll=errors.roll,
-        kick_x=errors.kick_x, kick_y=errors.kick_y,
-    )  # fmt: skip
-    if errors.loss:
-        own.loss = errors.loss / loss_of(element, energy)
-    if errors.k1l or errors.k1sl:
-        own.add_gradient("middle", normal=errors.k1l, skew=errors.k1sl)
-    if errors.entrance_k1l:
-        own.add_gradient("entrance", normal=errors.entrance_k1l)
-    if any(errors.entrance):
-        own.add_slopes("entrance", *errors.entrance)
-    if any(errors.middle):
-        own.add_slopes("middle", *errors.middle)
-    return own
+    loss = errors.loss / loss_of(element, energy) if errors.loss else 0.0
+    return Build(**{**vars(errors), "loss": loss})
 
 
 def _check(element: Element, wrong: Build) -> None:
     """Raise for errors that AT cannot build in an element of this kind."""
-    asked: set[str] = {*wrong.gradients, *wrong.slopes}
-    asked |= {name for name, value in vars(wrong).items() if value != getattr(NOTHING, name)}
-    more = sorted(asked - {"gradients", "slopes"} - _TAKES.get(element.kind, frozenset()))
+    places = {"k1l": "middle", "k1sl": "middle", "entrance_k1l": "entrance"}
+    asked = [name for name, value in vars(wrong).items() if value != getattr(NOTHING, name)]
+    more = sorted({places.get(name, name) for name in asked}
+                  - _TAKES.get(element.kind, frozenset()))  # fmt: skip
     if more:
         raise LatticeError(
             f"AT cannot build the {element.kind} '{element.name}' with another {', '.join(more)}"
@@ -177,23 +165,23 @@ class Builder:
         if build is None:
             raise LatticeError(f"AT cannot build the {element.kind} '{element.name}'")
         _check(element, wrong)
-        entrance = self._thin(element, wrong, "entrance")
+        entrance = self._thin(element, wrong.entrance_k1l, 0.0, wrong.entrance)
         made = [*entrance, *build(element, wrong, defaultdict(float, setting))]
         if not wrong.ds:
             return made
         there, back = (at.Drift(element.name, way) for way in (wrong.ds, -wrong.ds))
         return [there, *made, back]
 
-    def _thin(self, element: Element, wrong: Build, where: Where) -> list[Any]:
+    @staticmethod
+    def _thin(element: Element, normal: float, skew: float, slopes: Slopes) -> list[Any]:
         """Thin gradients, px -= normal x - skew y, py += normal y + skew x, and linear kicks
         (px, py) += slopes (x, y)."""
         made: list[Any] = []
-        if where in wrong.gradients:
-            normal, skew = wrong.gradients[where]
+        if normal or skew:
             made.append(at.ThinMultipole(element.name, [0.0, skew], [0.0, normal]))
-        if where in wrong.slopes:
+        if any(slopes):
             matrix = np.eye(6, order="F")
-            matrix[np.ix_([1, 3], [0, 2])] = np.reshape(wrong.slopes[where], (2, 2))
+            matrix[np.ix_([1, 3], [0, 2])] = np.reshape(slopes, (2, 2))
             made.append(at.M66(element.name, matrix))
         return made
 
@@ -201,7 +189,7 @@ class Builder:
         self, element: Element, wrong: Build, body: Callable[[float], list[Any]]
     ) -> list[Any]:
         """Return the body, or its two halves (`body` of a share of the length) and thin kicks."""
-        thin = self._thin(element, wrong, "middle")
+        thin = self._thin(element, wrong.k1l, wrong.k1sl, wrong.middle)
         if wrong.kick_x or wrong.kick_y:
             thin.append(
                 at.Corrector(element.name, 0.0, _turned(wrong.kick_x, wrong.kick_y, wrong.roll))
@@ -323,7 +311,7 @@ class Builder:
             )
 
         entrance, exit_ = source.fint * source.gap, source.fintx * source.gap
-        thin = self._thin(element, wrong, "middle")
+        thin = self._thin(element, wrong.k1l, wrong.k1sl, wrong.middle)
         if entrance == exit_ and not thin:
             made = [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
         else:  # AT's exact bend has one fringe integral for both edges
@@ -350,7 +338,7 @@ class Builder:
         return [at.M66(element.name, matrix, Length=element.length, **_kick(element))]
 
     def _wiggler(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
-        middle = self._thin(element, wrong, "middle")
+        middle = self._thin(element, wrong.k1l, wrong.k1sl, wrong.middle)
         if self.wigglers:
             middle += self._loss(element)
         if not middle:

@@ -126,7 +126,9 @@ class AtEngine:
     def _build(self, cavities: Sequence[int]) -> None:
         """Build the line. AT's ct is the path length: the velocity's contribution of slower
         particles is added before the cavities."""
-        nothing: Mapping[str, float] = {}
+        builder = self._builder
+        key = "AT", builder.steps, builder.aperture, builder.bend_pass
+        known: dict[int, list[Any]] = self.ring.remembered(key, dict)
         way = 0.0
 
         def velocity() -> list[Any]:
@@ -140,7 +142,12 @@ class AtEngine:
             if i in cavities:
                 self._line += velocity()
                 way = 0.0
-            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
+            pieces = known.get(i)
+            if pieces is None or i in self._wrong:
+                pieces = builder.pieces(element, self._wrong.get(i, NOTHING), {})
+                # those of the design, which no tracking changes; a wiggler's have a loss of theirs
+                if i not in self._wrong and element.kind != "wiggler":
+                    known[i] = pieces
             self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
             self._line += pieces
             way += element.length

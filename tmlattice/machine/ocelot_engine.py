@@ -38,7 +38,7 @@ class OcelotEngine:
         launches, there = np.asarray(launches, dtype=float), self._there
         beam = np.empty((len(launches), turns, len(there.maps.at), 2))
         for shots, setting in groups(settings, len(launches)):
-            layers = Group(0, shots, setting, True, there).layers
+            layers = Group(0, shots, setting, there).layers
             rf = there.cavities(setting) if turns > 1 else NO_RF
             beam[shots] = positions(launches[shots], turns, layers, rf)
         return beam

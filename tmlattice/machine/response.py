@@ -62,7 +62,7 @@ def simulate_response(
     """
     check_engine(engine)
     machine = StoredMachine(ring, causes, background, seed, machine_seed)
-    design = ResponseModel(ring)
+    design = ResponseModel.of(ring)
     columns = design.columns(correctors)
     rf = rf_of(ring)
     harmonic, frequency = rf.harmonic, rf.frequency(ring)
@@ -171,7 +171,7 @@ class StoredMachine:
 def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
     """Return the RF step, Hz, that raises the energy so that the design's orbit changes by 1.3 mm
     rms, to two digits; 0 without dispersion."""
-    model = ResponseModel(ring) if design is None else design
+    model = ResponseModel.of(ring) if design is None else design
     size = rms(model.rf_response()[:, 0])
     step = np.sign(model.rf_start[5]) * RF_ORBIT * rf_of(ring).frequency(ring)
     return float(f"{step / size:.1e}") if size else 0.0

@@ -92,6 +92,8 @@ class RingMaps:
         return np.searchsorted(self.at, np.arange(len(self.layers) + 2)).astype(np.int64)
 
 
+MAPS = ("maps",)
+"""Where the `memory` of a ring's layers has its `RingMaps`."""
 KNOWN = 20_000
 """Maps, and layers, in memory, some 40 MB: more than a large ring has different ones."""
 
@@ -152,6 +154,19 @@ class LayerMaps:
         ways = {k: other._composed(ring.elements[i] for i in self._ahead(k)) for k in changed}
         other._ways = {**self._ways, **ways}
         return other, sorted({int(self.layer_of[i]) for i in moving})
+
+    @classmethod
+    def of(cls, ring: Ring, dimension: int) -> "LayerMaps":
+        """Return the layers of a ring, remembered with it: for a design, which many models share.
+
+        Raises:
+            LatticeError: see `LayerMaps`.
+        """
+        return ring.remembered(("layers", dimension), lambda: cls(ring, dimension))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is remembered, which is large and made again."""
+        return {**vars(self), "memory": {}}
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
@@ -282,22 +297,26 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
     Args:
         ring: at least one magnet.
         dimension: 4 for (x, px, y, py) at the nominal energy, 6 for OCELOT's six coordinates.
-        layers: of the same ring, if available.
+        layers: of the same ring, if available; they remember the maps.
 
     Raises:
         LatticeError: a ring without magnets, or a map that is not finite.
         ValueError: another dimension.
     """
+    if layers is not None and MAPS in layers.memory:
+        remembered: RingMaps = layers.memory[MAPS]
+        return remembered
     key = cache.key("maps", ring.memory[KEPT], dimension) if KEPT in ring.memory else None
-    kept = cache.load(key, partial(_read, ring, dimension)) if key else None
-    if kept is not None:
-        return kept
-    maps = _made(ring, dimension, LayerMaps(ring, dimension) if layers is None else layers)
-    if key:
-        content = io.BytesIO()
-        stacks = {name: getattr(maps, name) for name in _KEPT}
-        np.savez(content, *maps.closing.coefficients, **stacks)
-        cache.save(key, content.getvalue())
+    maps = cache.load(key, partial(_read, ring, dimension)) if key else None
+    if maps is None:
+        maps = _made(ring, dimension, LayerMaps(ring, dimension) if layers is None else layers)
+        if key:
+            content = io.BytesIO()
+            stacks = {name: getattr(maps, name) for name in _KEPT}
+            np.savez(content, *maps.closing.coefficients, **stacks)
+            cache.save(key, content.getvalue())
+    if layers is not None:
+        layers.memory[MAPS] = maps
     return maps
 
 

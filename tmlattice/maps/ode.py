@@ -7,7 +7,7 @@ coefficient vector [n]. Free fall with drag, dv/dt = 9.8 - 0.00392 v^2:
 >>> fall.coefficients                    # [0.979874527], [[0.999615938]], [[-3.91799e-4]]
 >>> ode_of_taylor_map(fall, time=0.1)    # {(0,): [9.8], (1,): [0], (2,): [-0.00392]}
 
-A coefficient that depends on time is a function of t that returns the vector.
+A coefficient that oscillates in time is a further coordinate: s' = omega c, c' = -omega s.
 """
 
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ from tmlattice.maps.taylor import (
     parent_of,
 )
 
-Terms = Mapping[Exponents, ArrayLike | Callable[[float], ArrayLike]]
+Terms = Mapping[Exponents, ArrayLike]
 
 ROUNDING = 1e-17  # below half a unit in the last place
 STEPS = 10_000
@@ -40,67 +40,47 @@ class OdeError(TmlatticeError):
 
 
 class _Equation:
-    """Compiled right-hand side: exponents with their coefficients, and how to build them."""
+    """Compiled right-hand side.
+
+    Attributes:
+        n: number of coordinates.
+        terms: exponents with their coefficient vectors [n].
+        products: exponents of more than one factor in the terms, those they are built from first.
+    """
 
     def __init__(self, terms: Terms) -> None:
         if not terms:
             raise ValueError("an equation needs at least one term: {exponents: coefficients}")
         self.n = len(next(iter(terms)))
-        self.constant = not any(callable(c) for c in terms.values())
-        self._coefficients = dict(terms)
+        self.terms = [(e, np.asarray(c, dtype=float)) for e, c in terms.items()]
         needed: dict[Exponents, None] = {}
-        for exponents, coefficient in terms.items():
+        for exponents, coefficient in self.terms:
             if len(exponents) != self.n or any(e < 0 for e in exponents) or not self.n:
                 raise ValueError(f"{exponents} are no exponents of {self.n} coordinates")
-            if not callable(coefficient) and np.shape(coefficient) != (self.n,):
+            if coefficient.shape != (self.n,):
                 raise ValueError(
-                    f"the coefficient of {exponents} has the shape {np.shape(coefficient)}; "
+                    f"the coefficient of {exponents} has the shape {coefficient.shape}; "
                     f"it should be ({self.n},)"
                 )
             below = tuple(exponents)
             while sum(below) > 0:
                 needed[below] = None
                 below = parent_of(below)[0]
-        self.products = sorted((e for e in needed if sum(e) > 1), key=sum)  # parents come first
-
-    def coefficients(self, t: float) -> list[tuple[Exponents, Array]]:
-        """Return exponents and coefficient vectors at the time t."""
-        return [
-            (e, np.asarray(c(t) if callable(c) else c, dtype=float))
-            for e, c in self._coefficients.items()
-        ]
-
-    def of_map(self, t: float, rows: Array, table: _Table) -> Array:
-        """Return d rows/dt of a map's rows [n, monomial]: the right-hand side of the weights."""
-        values = self._units(rows)
-        for exponents in self.products:
-            below, variable = parent_of(exponents)
-            values[exponents] = table.multiply(values[below], rows[variable])
-        total = np.zeros_like(rows)
-        for exponents, coefficient in self.coefficients(t):
-            total += coefficient[:, None] * values[exponents]
-        return total
-
-    def _units(self, rows: Array) -> dict[Exponents, Array]:
-        """X^0 = 1 and the coordinates."""
-        one = np.zeros_like(rows[0])
-        one[..., 0] = 1.0
-        units = {tuple(int(i == j) for j in range(self.n)): rows[i] for i in range(self.n)}
-        return {(0,) * self.n: one, **units}
+        self.products = sorted((e for e in needed if sum(e) > 1), key=sum)
 
 
 def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
     """Return dX/dt as a function of the time and of states [..., n], for a numerical solver.
 
     Args:
-        terms: exponents -> coefficient vector [n], or a function of t that returns it.
+        terms: exponents -> coefficient vector [n].
     """
     equation = _Equation(terms)
 
     def slope(t: float, x: ArrayLike) -> Array:
         x = np.asarray(x, dtype=float)
         total = np.zeros_like(x)
-        for exponents, coefficient in equation.coefficients(t):
+        for exponents, coefficient in equation.terms:
             total += np.prod(x ** np.array(exponents), axis=-1)[..., None] * coefficient
         return total
 
@@ -122,24 +102,18 @@ def recentred(terms: Mapping[Exponents, ArrayLike], centre: ArrayLike) -> dict[E
     return result
 
 
-def taylor_map_of_ode(
-    terms: Terms, order: int, time: float, start: float = 0.0, tolerance: float = 1e-13
-) -> TaylorMap:
-    """Return the map from X(start) to X(start + time) under dX/dt = sum of terms, up to `order`.
+def taylor_map_of_ode(terms: Terms, order: int, time: float) -> TaylorMap:
+    """Return the map from X(0) to X(time) under dX/dt = sum of terms, up to `order`.
 
     It is the flow's Taylor polynomial in its start at X = 0, constant terms included: each
     coefficient is that of the exact flow, whatever the degree of the terms. The weights obey the
-    equation dM/dt = F(M), truncated at the order. With constant coefficients it is solved by Lie
-    series (Taylor series in time), in as many steps as rounding-error convergence needs; with
-    coefficients that depend on time by DOP853.
+    equation dM/dt = F(M), truncated at the order. It is solved by Lie series (Taylor series in
+    time), in as many steps as rounding-error convergence needs.
 
     Args:
-        terms: exponents [n] -> coefficient vector [n], or a function of t that returns it; units
-            are the coordinates' own.
+        terms: exponents [n] -> coefficient vector [n]; units are the coordinates' own.
         order: of the truncation in X, 1 or more.
         time: duration; may be negative.
-        start: initial time, for coefficients that depend on time.
-        tolerance: relative error of the weights, for coefficients that depend on time.
 
     Raises:
         OdeError: the solution from X = 0 diverges before the end.
@@ -153,12 +127,8 @@ def taylor_map_of_ode(
         raise ValueError(f"a map has at least the order 1, not {order}")
     table = _table(equation.n, order)
     rows = TaylorMap.identity(equation.n, order)._rows
-    if time == 0:
-        return TaylorMap._of_rows(rows, order)
-    if equation.constant:
+    if time:
         rows = _lie_series(equation, rows, time, table)
-    else:
-        rows = _integrated(equation, rows, (start, start + time), table, tolerance)
     return TaylorMap._of_rows(rows, order)
 
 
@@ -196,38 +166,17 @@ def _series(
     n, monomials = rows.shape
     x = np.zeros((degree + 1, n, monomials))
     x[0] = rows
-    values = equation._units(x.swapaxes(0, 1))  # views of x, filled with it
-    values[(0,) * n] = np.zeros((degree + 1, monomials))
+    # the coordinates are views of x, filled with it
+    values = {tuple(int(i == j) for j in range(n)): x[:, i] for i in range(n)}
+    values |= {e: np.zeros((degree + 1, monomials)) for e in ((0,) * n, *equation.products)}
     values[(0,) * n][0, 0] = 1.0
-    for exponents in equation.products:
-        values[exponents] = np.zeros((degree + 1, monomials))
-    coefficients = equation.coefficients(0.0)
     for j in range(degree):
         for exponents in equation.products:
             below, variable = parent_of(exponents)
             values[exponents][j] = table.convolve(values[below][: j + 1], x[j::-1, variable])
-        slope = sum(c[:, None] * values[e][j] for e, c in coefficients)
+        slope = sum(c[:, None] * values[e][j] for e, c in equation.terms)
         x[j + 1] = direction * slope / (j + 1)
     return x
-
-
-def _integrated(
-    equation: _Equation, rows: Array, span: tuple[float, float], table: _Table, tolerance: float
-) -> Array:
-    from scipy.integrate import solve_ivp
-
-    def slope(t: float, flat: Array) -> Array:
-        return equation.of_map(t, flat.reshape(rows.shape), table).ravel()
-
-    done = solve_ivp(
-        slope, span, rows.ravel(), method="DOP853", rtol=tolerance, atol=1e-3 * tolerance
-    )
-    if not done.success:
-        raise OdeError(
-            f"the weights could not be followed beyond t = {done.t[-1]:.6g} ({done.message}); "
-            "take a shorter time"
-        )
-    return np.asarray(done.y[:, -1].reshape(rows.shape))
 
 
 def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Array]:

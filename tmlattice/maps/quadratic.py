@@ -1,7 +1,8 @@
 """The second-order map of one element, from OCELOT's own matrices and the element's errors.
 
 OCELOT gives an element as a sequence of parts (three for a bend: entrance edge, body, exit edge),
-each x -> B + R x + x^T T x. The parts are composed to second order.
+each x -> B + R x + x^T T x. The parts are composed to second order. Straight quadrupoles, of which
+a fit of gradients asks for hundreds in each step, have the same maps in closed form, all at once.
 """
 
 import cmath
@@ -65,7 +66,8 @@ class Quadratic:
         i, j, counts = _pairs(self.R.shape[-1])
         if self.T is None:
             return self.B, self.R, np.zeros((*self.B.shape, len(i)))
-        return self.B, self.R, counts * self.T[..., i, j]
+        # by rows, as kernels are compiled for; an indexed array has another order
+        return self.B, self.R, np.multiply(counts, self.T[..., i, j], order="C")
 
     def __getitem__(self, which: Any) -> "Quadratic":
         """Some maps of a stack."""
@@ -191,9 +193,11 @@ def quadratic_maps(elements: Sequence[Element], energy: float, n: int) -> Quadra
     ]
     wrong = [element for element in given if element.errors != NO_ERRORS]
     with_errors = iter(_with_errors(wrong, energy, n).each() if wrong else ())
+    known = _straight([element for element in given if element.errors == NO_ERRORS], energy, n)
     total = stacked([
-        composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
-        if element.errors == NO_ERRORS else next(with_errors)
+        next(with_errors) if element.errors != NO_ERRORS
+        else known.get(id(element))
+        or composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
         for element in given
     ], n)  # fmt: skip
     for own in (total.B, total.R, total.T):
@@ -206,11 +210,13 @@ def quadratic_maps(elements: Sequence[Element], energy: float, n: int) -> Quadra
 
 
 def _with_errors(elements: Sequence[Element], energy: float, n: int) -> Quadratic:
+    known = _straight(elements, energy, n, 0.5)
     # unchanged by errors in the middle
     halves = [
-        _remembered(_halved, element, (energy, n), partial(_halves, element, energy, n))
+        (known[id(element)],) * 2 if id(element) in known
+        else _remembered(_halved, element, (energy, n), partial(_halves, element, energy, n))
         for element in elements
-    ]
+    ]  # fmt: skip
     first, second = (stacked(own, n) for own in zip(*halves, strict=True))
     e = {own.name: np.array([getattr(element.errors, own.name) for element in elements])
          for own in fields(Errors)}  # fmt: skip
@@ -227,6 +233,46 @@ def _with_errors(elements: Sequence[Element], energy: float, n: int) -> Quadrati
         _loss(n, e["loss"], elements), second, _turn(n, -e["roll"]),
         _shift(n, e["dx"], e["dy"]), back,
     ])  # fmt: skip
+
+
+def _straight(
+    elements: Sequence[Element], energy: float, n: int, share: float = 1.0
+) -> dict[int, Quadratic]:
+    """The maps of upright straight quadrupoles, or of a share of their bodies, by `id`.
+
+    To first order in the momentum deviation they differ by the integral of px^2 + py^2 along the
+    trajectory, as drifts do, which is quadratic in the launch.
+    """
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    own = [
+        element for element in elements
+        if element.kind == "quadrupole" and type(element.source) is ocelot.Quadrupole
+        and not (element.tilt or element.k2 or element.source.dx or element.source.dy)
+    ]  # fmt: skip
+    length = share * np.array([element.length for element in own])
+    k1 = np.array([element.k1 for element in own])
+    metre = _metre(n, energy)
+    R = np.eye(n) + length[:, None, None] * (metre.R - np.eye(n))
+    T = None if metre.T is None else length[:, None, None, None] * metre.T
+    for x, k in ((0, k1), (2, -k1)):
+        plane = slice(x, x + 2)
+        phase = np.sqrt(k.astype(complex)) * length
+        c, s = np.cos(phase).real, length * np.sinc(phase / np.pi).real
+        R[:, plane, plane] = _two_by_two(c, s, -k * s, c)
+        if T is not None and metre.T is not None:
+            # integrals of the squares of px by x and by px, and of their product
+            xx, pp, xp = k * (length - s * c) / 2, (length + s * c) / 2, -k * s**2 / 2
+            bent = R[:, plane, plane] @ _two_by_two(xp, pp, -xx, -xp) * metre.T[x, x + 1, 5]
+            T[:, plane, plane, 5] = T[:, plane, 5, plane] = bent
+            T[:, 4, plane, plane] = _two_by_two(xx, xp, xp, pp) * metre.T[4, x + 1, x + 1]
+    maps = Quadratic(np.zeros((len(own), n)), R, T)
+    return {id(element): made for element, made in zip(own, maps.each(), strict=True)}
+
+
+def _two_by_two(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Matrices of these entries, row by row, [map, 2, 2]."""
+    return np.stack([a, b, c, d], axis=1).reshape(-1, 2, 2)
 
 
 def _in_the_middle(element: Element) -> tuple[float, float]:

@@ -182,9 +182,8 @@ def _back(size, signs, A, G, D):  # type: ignore[no-untyped-def]
 
 
 def _signs(n: int) -> Array:
-    if n not in (2, 4, 6):
-        raise ValueError(f"no symplectic form for {n} coordinates: 2, 4 and 6 have one")
-    return np.array([1.0, 1.0, -1.0] if n == 6 else [1.0] * (n // 2))
+    """Signs of the pairs of coordinates in the symplectic form."""
+    return np.diag(symplectic_form(n), 1)[::2].copy()
 
 
 def _tiles(w1: Array) -> int:

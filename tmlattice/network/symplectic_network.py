@@ -1,5 +1,6 @@
 """The ring in layers that are symplectic by construction."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -186,10 +187,14 @@ class SymplecticNetwork(NetworkChain):
         rest = (w[ends] for w in (*fields, moves, flat))
         sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
 
-    def tangents(self, x: Array) -> tuple[Array, Array]:
-        """Return what `LayerChain.tangents` states."""
-        path, steps = self.jacobians(x)
-        return path, products(steps)
+    def linearised(self) -> Callable[[Array], tuple[Array, Array]]:
+        """Return what `LayerChain.linearised` states."""
+
+        def tangents(x: Array) -> tuple[Array, Array]:
+            path, steps = self.jacobians(x)
+            return path, products(steps)
+
+        return tangents
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
         """Return the same states, and the Jacobian of every layer and of the closing drift."""

@@ -258,7 +258,7 @@ class OfResponse(OfColumns):
     @cached_property
     def design(self) -> tuple[Array, Array]:
         """Response to steps of one [corrector, monitor, 2], and to a relative RF step of one."""
-        data, model = self.data, ResponseModel(self.ring, 6 if self.stepped else 4)
+        data, model = self.data, ResponseModel.of(self.ring, 6 if self.stepped else 4)
         columns = model.columns(data.correctors)
         for name, plane, own in zip(data.correctors, data.planes, columns.planes, strict=True):
             if plane != own:

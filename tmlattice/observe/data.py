@@ -6,13 +6,12 @@ projected out of data and signatures. Prior knowledge of a launch adds rows: [sh
 coordinates], flattened.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.effects import Settings
@@ -37,7 +36,6 @@ class Data:
         launch_sigma: its rms; inf where unknown, 0 where exact, [shot, 5].
         settings: of each shot.
         turns: of each shot.
-        active: shots in which the causes sought act; not those of a reference, [shot].
     """
 
     readings: Array
@@ -47,7 +45,6 @@ class Data:
     launch_sigma: Array
     settings: tuple[Settings, ...]
     turns: int
-    active: Flags
 
     @property
     def shots(self) -> int:
@@ -64,18 +61,12 @@ class Data:
         filled = np.where(np.isfinite(self.sigma), self.sigma, planes)
         return replace(self, sigma=filled)
 
-    def of_shots(self, shots: NDArray[np.intp]) -> "Data":
-        """Return some of the shots."""
-        names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
-        arrays = {name: getattr(self, name)[shots] for name in names}
-        return replace(self, settings=tuple(self.settings[i] for i in shots), **arrays)
-
     def without(self, dropped: Flags) -> "Data":
         """Return the data without some readings."""
         return replace(self, valid=self.valid & ~dropped)
 
 
-def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False) -> Data:
+def of_measurement(ring: Ring, measurement: Measurement) -> Data:
     """Return the shots of a measurement.
 
     Raises:
@@ -86,7 +77,7 @@ def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False
     data = _of_turns(measurement.in_order_of(names), None)
     if not data.valid.any():
         raise MeasurementError("every reading is missing; nothing can be diagnosed")
-    return replace(data, active=np.full(data.shots, not reference))
+    return data
 
 
 def _of_turns(ordered: Measurement, turns: int | None) -> Data:
@@ -107,24 +98,7 @@ def _of_turns(ordered: Measurement, turns: int | None) -> Data:
         launch_sigma=launch_sigma,
         settings=tuple(ordered.settings or ({} for _ in range(shots))),
         turns=turns,
-        active=np.ones(shots, dtype=bool),
     )
-
-
-def joined(first: Data, second: Data) -> Data:
-    """Return the shots of both.
-
-    Raises:
-        MeasurementError: different numbers of turns.
-    """
-    if first.turns != second.turns:
-        raise MeasurementError(
-            f"the reference has {first.turns} turns and the measurement {second.turns}; "
-            "give both the same number (Measurement.select)"
-        )
-    names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
-    arrays = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
-    return Data(settings=first.settings + second.settings, turns=first.turns, **arrays)
 
 
 def launch_errors(
@@ -219,12 +193,12 @@ class Whitening:
         """Return the whitening of readings that distributed errors correlate.
 
         Args:
-            root: W of `inference.whitening` over all rows, those of the launches too, [row, row].
+            root: W of `inference.whitening`, [white row, row], with the columns of these rows,
+                those of the launches too.
         """
         other = copy(self)
         readings = np.arange(self.rows).reshape(self.shots, -1)[:, :-5].ravel()
-        other.__dict__.pop("precision", None)
-        other._inverse = root[np.ix_(readings, readings)]
+        other._inverse, other.rows = root[:, readings], len(root)
         return other
 
     @property
@@ -232,41 +206,30 @@ class Whitening:
         """Whether readings of different shots are correlated."""
         return self._inverse is not None
 
-    @cached_property
-    def precision(self) -> Array:
-        """Inverse covariance of readings in units of their own noise, all shots, [row, row]."""
-        assert self._inverse is not None
-        return np.asarray(self._inverse.T @ self._inverse)
-
     def projected_precision(self, projection: Projection) -> Array:
-        """The precision less what launches explain, in units of the readings' noise, [row, row]."""
+        """Inverse covariance of the readings of all shots in units of their own noise, less what
+        launches explain, [row, row]."""
         assert self._inverse is not None
-        _, rows, width = projection.Q.shape
-        Q = projection.Q[0].reshape(self.shots, rows // self.shots, width)[:, :-5]
-        along = self._inverse.T @ Q.reshape(len(self._inverse), width)
-        return np.asarray(self.precision - along @ along.T)
+        along = self._inverse.T @ projection.Q[0]
+        return np.asarray(self._inverse.T @ self._inverse - along @ along.T)
 
     def back(self, rows: Array) -> Array:
-        """Adjoint of `signature`: whitened rows [..., shot, reading * 2] as [..., shot, reading,
-        2], 1 / m."""
-        flat = rows.reshape(*rows.shape[:-2], -1)
-        if self._inverse is not None:
-            flat = flat @ self._inverse
-        return np.asarray(self.weight * flat.reshape(*rows.shape[:-2], *self.weight.shape))
-
-    def _flat(self, x: Array) -> Array:
-        rows = (self.weight * x).reshape(*x.shape[:-3], -1)
+        """Adjoint of `signature`: white rows [..., row] as [..., shot, reading, 2], 1 / m."""
         if self._inverse is None:
-            return np.asarray(rows)
-        flat = rows.reshape(-1, rows.shape[-1])
-        return np.asarray(flat @ self._inverse.T).reshape(rows.shape)
+            flat = rows.reshape(*rows.shape[:-1], self.shots, -1)[..., :-5]
+        else:
+            flat = rows @ self._inverse
+        return np.asarray(self.weight * flat.reshape(*rows.shape[:-1], *self.weight.shape))
 
     def signature(self, x: Array) -> Array:
         """x [..., shot, reading, 2] in m as rows [..., row]; zero in the launch's rows."""
-        flat = self._flat(x)
+        flat = (self.weight * x).reshape(*x.shape[:-3], self.weight.size)
+        if self._inverse is not None:
+            white = flat.reshape(-1, flat.shape[-1]) @ self._inverse.T
+            return np.asarray(white.reshape(*flat.shape[:-1], self.rows))
         out = np.zeros((*flat.shape[:-1], self.shots, self.weight[0].size + 5))
-        out[..., :-5] = flat.reshape(*flat.shape[:-1], self.shots, -1)
-        return out.reshape(*flat.shape[:-1], -1)
+        out[..., :-5] = flat.reshape(*flat.shape[:-1], self.shots, self.weight[0].size)
+        return out.reshape(*flat.shape[:-1], self.rows)
 
     def residual(self, difference: Array, launches: Array) -> Array:
         """Readings less model [shot, reading, 2], and nominal less fitted launches, as rows."""
@@ -275,40 +238,20 @@ class Whitening:
         return rows.reshape(-1)
 
     def launch(self, slopes: Array) -> Array:
-        """d rows / d free launch coordinates from d readings / d launch [shot, reading, 2, 5].
-
-        Returns:
-            [shot, row of the shot, column]; where shots are correlated, one block for all:
-            [1, row, shot * column].
-        """
-        p = len(self.columns)
-        if p == 0:  # every launch is known exactly
-            blocks = 1 if self.dense else self.shots
-            return np.zeros((blocks, self.rows // blocks, 0))
+        """d rows / d free launch coordinates from d readings / d launch [shot, reading, 2, 5],
+        without distributed errors, [shot, row of the shot, column]."""
         moved = np.moveaxis(slopes[..., self.columns], -1, 0)  # [column, shot, reading, 2]
-        if not self.dense:
-            parts = self.signature(moved).reshape(p, self.shots, -1)
-            for i, column in enumerate(self.columns):
-                parts[i, :, -5 + column] = self._prior[:, column]
-            return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
-        (alone,) = each_shot(moved[None], range(self.shots))
-        rows = self.signature(alone).reshape(self.shots, p, self.shots, -1)
-        for shot in range(self.shots):
-            for i, column in enumerate(self.columns):
-                rows[shot, i, shot, -5 + column] = self._prior[shot, column]
-        return np.ascontiguousarray(rows.reshape(self.shots * p, -1).T)[None]
+        size = len(self.columns), self.shots, self.rows // self.shots
+        parts = self.signature(moved).reshape(size)
+        for i, column in enumerate(self.columns):
+            parts[i, :, -5 + column] = self._prior[:, column]
+        return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
 
 
-def each_shot(moved: Array, shots: Iterable[int]) -> Array:
+def each_shot(moved: Array) -> Array:
     """Return changes [place, parameter, shot, ...] of a single shot each, zero in the others,
-    [place, single shot, parameter, shot, ...].
-
-    Args:
-        moved: changes of all shots.
-        shots: the single ones.
-    """
-    shots = list(shots)
+    [place, single shot, parameter, shot, ...]."""
+    shots = np.arange(moved.shape[2])
     alone = np.zeros((len(moved), len(shots), *moved.shape[1:]))
-    for i, shot in enumerate(shots):
-        alone[:, i, :, shot] = moved[:, :, shot]
+    alone[:, shots, :, shots] = np.moveaxis(moved, 2, 0)
     return alone

@@ -3,8 +3,8 @@
 >>> problem = FirstTurns(model=Model(ring, data.settings), data=data, places={})
 >>> fit(problem, [Cause("quadrupole_gradient", "qd::12", -0.1)], data.launches)
 
-Nuisances are the launches (x, px, y, py, delta), [shot, 5]. A free kick is (px, py) in every active
-shot, in the middle of a layer's magnet; its parameters are [active shot * 2].
+Nuisances are the launches (x, px, y, py, delta), [shot, 5]. A free kick is (px, py) in every shot,
+in the middle of a layer's magnet; its parameters are [shot * 2].
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,9 @@ from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Hypothesis, ReadingEffect, RingEffect, find
 from tmlattice.inference.judgement import ENOUGH
-from tmlattice.inference.newton import ITERATIONS, fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import Projection, Root
-from tmlattice.observe.data import EXACT, Data, Whitening, each_shot
+from tmlattice.observe.data import Data, Whitening, each_shot
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
 from tmlattice.observe.sections import TWO
@@ -72,7 +70,7 @@ class FirstTurns(Problem):
         for cause in causes:
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
-        if len(built) < MAX_CHANGES and self.alone:
+        if len(built) < MAX_CHANGES:
             return super().with_fixed(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
@@ -103,12 +101,6 @@ class FirstTurns(Problem):
             ends.append(self.model.readings(point.nuisances, there, kicks))
         return self.whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
 
-    def metres(self, row: Array) -> Array:
-        """A slope in units of uncorrelated readings, [shot * reading * 2], m."""
-        rows = row.reshape(self.data.shots, -1)[:, :-5].reshape(self.valid.shape)
-        weight = self.whitening.weight
-        return np.where(weight > 0, rows / np.where(weight > 0, weight, 1.0), 0.0).ravel()
-
     def moved(self, nuisances: Array, change: Array) -> Array:
         """Launches after a change of their free coordinates."""
         launches = nuisances.copy()
@@ -120,37 +112,18 @@ class FirstTurns(Problem):
         assert point.projection is not None
         return self._metric(point, self.whitening, point.projection)
 
-    def metric_among(self, point: Point, root: Root, projection: Projection) -> TurnMetric:
+    def metric_among(
+        self, point: Point, root: Root, rows: slice, projection: Projection
+    ) -> TurnMetric:
         """Return products from sums over the readings behind each monitor, see `DenseMetric`."""
-        return self._metric(point, self.whitening.correlated(root.matrix), projection)
+        return self._metric(point, self.whitening.correlated(root.matrix[:, rows]), projection)
 
     def _metric(self, point: Point, whitening: Whitening, projection: Projection) -> TurnMetric:
         """The quickest products for this noise."""
-        model, active = self.model, self.data.active
+        model = self.model
         kind: type[TurnMetric] = DenseMetric if model.turns == 1 else TurnMetric
         kind = kind if whitening.dense else IndependentMetric
-        return kind(model, point.view, point.nuisances, whitening, projection, active)
-
-    @property
-    def alone(self) -> bool:
-        """Whether no shot is a reference."""
-        return bool(self.data.active.all())
-
-    def reference(self, nuisances: Array) -> "tuple[FirstTurns | None, Array]":
-        """Return the reference shots."""
-        if self.alone:
-            return None, nuisances
-        shots = np.flatnonzero(~self.data.active)
-        data = self.data.of_shots(shots)
-        data = replace(data, active=np.ones(len(shots), dtype=bool))
-        known = self.model.assembly.known
-        model = Model(self.model.design, data.settings, data.turns, known, active=data.active)
-        return replace(self, model=model, data=data), nuisances[shots]
-
-    def everywhere(self) -> "FirstTurns":
-        """Return the problem with causes that act in all shots."""
-        every = np.ones(self.data.shots, dtype=bool)
-        return replace(self, data=replace(self.data, active=every))
+        return kind(model, point.view, point.nuisances, whitening, projection)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return hypotheses between the same monitors as a magnet."""
@@ -174,17 +147,13 @@ class FirstTurns(Problem):
         return self.model.maps.layers
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """Rows of (px, py) in the middle of a magnet, independent in each active shot."""
+        """Rows of (px, py) in the middle of a magnet, independent in each shot."""
         kicked = self.model.kick_signatures(point.view, np.array([place]))
-        shots = np.flatnonzero(self.data.active)
-        return self.whitening.signature(each_shot(kicked, shots)).reshape(2 * len(shots), -1)
+        return self.whitening.signature(each_shot(kicked)).reshape(2 * self.data.shots, -1)
 
-    def _of_shots(self, kicks: Kicks) -> dict[int, Array]:
-        whole = {}
-        for place, values in kicks.items():
-            whole[place] = np.zeros((self.data.shots, 2))
-            whole[place][self.data.active] = values.reshape(-1, 2)
-        return whole
+    @staticmethod
+    def _of_shots(kicks: Kicks) -> dict[int, Array]:
+        return {place: values.reshape(-1, 2) for place, values in kicks.items()}
 
     @property
     def monitors(self) -> Sequence[str]:
@@ -249,53 +218,6 @@ class FirstTurns(Problem):
         if not dropped.any():
             return self
         return replace(self, data=self.data.without(dropped))
-
-
-def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> HeldOut:
-    """Residuals of a model on held-out shots.
-
-    In each shot the launch alone is fitted, to one half of the monitors; the readings of the other
-    half are predicted.
-
-    Args:
-        problem: of these shots; its `fixed` causes are the model's.
-        unknown: covariance of all readings by the model's uncertainty, [shot * reading * 2] twice,
-            m^2; None: none.
-    """
-    data = problem.data
-    odd = problem.owner() % 2 == 1
-    fitted = problem.without(odd)
-    point = fit(fitted, (), fitted.first, steps=ITERATIONS).point
-    residuals = np.full(data.valid.shape, np.nan)
-    if point.projection is None:
-        return HeldOut(residuals, ())
-    left = np.where(data.valid, data.readings - point.view.readings, 0.0)
-    columns = fitted.whitening.columns
-    off = (data.launches - point.nuisances)[:, columns]
-    sigma = np.maximum(fitted.data.launch_sigma[:, columns], EXACT)
-    index = np.arange(data.valid.size).reshape(data.valid.shape)
-    parts = []
-    for shots in np.array_split(np.arange(data.shots), data.shots if unknown is None else 1):
-        slopes = np.zeros((*data.valid[shots].shape, len(shots), len(columns)))
-        for i, shot in enumerate(shots):
-            slopes[i, ..., i, :] = point.view.launch[shot][..., columns]
-        gives, scored = data.valid[shots] & ~odd[shots], data.valid[shots] & odd[shots]
-        if not scored.any():
-            continue
-        known = np.where(np.isfinite(sigma[shots]), sigma[shots] ** -2.0, 0.0)
-        width = known.size
-        first, second = (
-            Half(
-                left[shots][half], slopes[half].reshape(half.sum(), width), data.sigma[shots][half]
-            )
-            for half in (gives, scored)
-        )
-        order = np.concatenate([index[shots][gives], index[shots][scored]])
-        among = None if unknown is None else unknown[np.ix_(order, order)]
-        found = cross_predicted(first, second, off[shots].ravel(), known.ravel(), among)
-        parts.append(found)
-        residuals.flat[index[shots][scored]] = found.residual
-    return HeldOut(residuals, tuple(parts))
 
 
 def _bounded(data: Data, model: Model) -> Data:

@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices, rms
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices, finite, rms
 from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -145,7 +145,7 @@ class Split:
         most = freedom.max(axis=0)
         root = np.sqrt(count)
         return cls(
-            mean * root, usual, np.nan_to_num(kicked) * root[..., None],
+            mean * root, usual, finite(kicked) * root[..., None],
             size * np.where(freedom > 0, each, 0.0).sum(axis=0),
             np.stack([most, freedom.sum(axis=0) - most]), errors,
         )  # fmt: skip
@@ -160,10 +160,10 @@ class Split:
         size, even = scaled(self.spread)
         width, axes = np.linalg.eigh(even)
         back = np.swapaxes(axes / np.sqrt(np.maximum(width, INVISIBLE))[:, None], 1, 2)
-        kicked = back @ np.nan_to_num(self.kicked / size[..., None], posinf=0, neginf=0)
+        kicked = back @ finite(self.kicked / size[..., None], posinf=0, neginf=0)
         by_kicks, axes = np.linalg.eigh(kicked @ np.swapaxes(kicked, 1, 2))
         limit = DIVERGED_SIGMA
-        common = np.clip(np.nan_to_num(self.common / size, nan=limit), -limit, limit)
+        common = np.clip(finite(self.common / size, nan=limit), -limit, limit)
         along = np.swapaxes(axes, 1, 2) @ (back @ common[..., None])  # the axes of the kicks
         own = along[..., 0] ** 2
         wider = 1 + kicks[:, None, None] * np.maximum(by_kicks, 0.0)
@@ -318,7 +318,7 @@ def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
     """An assumption with the chi-square that falls most."""
     pairs = []
     for one, then in ((stated.levels, other.levels), (stated.launch, other.launch)):
-        which = int(np.nan_to_num(one / np.maximum(then, 1e-12)).argmax())
+        which = int(finite(one / np.maximum(then, 1e-12)).argmax())
         pairs.append((float(one[which]), float(then[which])))
     (local, local_then), (launch, _) = pairs
     # the sections may agree either way: then the launches decide
@@ -328,7 +328,10 @@ def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
     return Verdict(names, gain, *pairs[of_launch], of, left=left)
 
 
-def _parts(passes: Passes, found: SectionFits) -> tuple[Split, list[Split], list[Array]]:
+Parts = tuple[Split, list[Split], list[Array]]
+
+
+def _parts(passes: Passes, found: SectionFits) -> Parts:
     """Mismatches of the sections, and of their joints, those between turns too; and the joints'
     covariances."""
     left = np.eye(found.left.shape[2])[None, None]
@@ -376,6 +379,7 @@ class OfTurns(Search):
         default_factory=dict, repr=False
     )
     _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
+    _split: dict[Key, Parts] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", _part(in_beam_order(self.data, self.monitors)))
@@ -401,6 +405,13 @@ class OfTurns(Search):
         """Return the trajectories of the sections of a measurement."""
         self._fit([data])
         return self._found[self._key(data)][1:]
+
+    def _mismatches(self, data: Measurement) -> Parts:
+        """The mismatches of a measurement, see `_parts`."""
+        key = self._key(data)
+        if key not in self._split:
+            self._split[key] = _parts(*self.found(data))
+        return self._split[key]
 
     def _key(self, data: Measurement) -> Key:
         return id(data.readings), self._times(data), data.launches[:, 4].tobytes()
@@ -468,7 +479,7 @@ class OfTurns(Search):
         """
         data = self.assumed(names)
         passes, found = self.found(data)
-        sections, joints, spreads = _parts(passes, found)
+        sections, joints, spreads = self._mismatches(data)
         backwards = "beam-backwards" in names
         launch, blur = self._launch(data, passes, found, square, backwards)
         times = _size(data) / self.scale
@@ -522,7 +533,7 @@ class OfTurns(Search):
         each, *changes = (distance(own, launch.spread) for own in several)
         size = np.maximum(np.ptp(stated, axis=0), TINY)
         a, b = ((own - np.mean(own, axis=0)) / size for own in (fitted, stated))
-        a, b = (np.nan_to_num(own).reshape(-1, 2, 2) for own in (a, b))
+        a, b = (finite(own).reshape(-1, 2, 2) for own in (a, b))
         inner, square_a, square_b = ((u * v).sum(axis=(0, 2)) for u, v in ((a, b), (a, a), (b, b)))
         alike = (inner**2 > ALIKE**2 * square_a * square_b) & (inner != 0)
         ratio = np.where(alike, inner, np.nan) / np.maximum(square_b, TINY)
@@ -566,7 +577,7 @@ class OfTurns(Search):
         times = _size(data) / self.scale
         open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
         blur = log_uncertainty(np.eye(4) + open_)
-        miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=FARTHEST), -FARTHEST, FARTHEST)
+        miss = np.clip(finite(fitted - stated[:, :4], nan=FARTHEST), -FARTHEST, FARTHEST)
         planes = miss.reshape(-1, 2, 2)
         spreads = np.stack([spread[:, p, p] for p in (slice(0, 2), slice(2, 4))], axis=1)
         free = np.full(planes.shape[:2], 2)
@@ -618,8 +629,8 @@ class OfTurns(Search):
         assumptions."""
         found = []
         for names in several:
-            passes, own = self.found(self.assumed(names))
-            found += [own.level, _parts(passes, own)[0].level()]
+            data = self.assumed(names)
+            found += [self.found(data)[1].level, self._mismatches(data)[0].level()]
         return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
     def improving(self) -> list[Verdict]:
@@ -663,7 +674,7 @@ class OfTurns(Search):
         """Return the search with assumptions corrected in the data."""
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
-        return replace(self, data=data, _sections=sections, _found={}, _made={})
+        return replace(self, data=data, _sections=sections, _found={}, _made={}, _split={})
 
 
 def _same_part(one: str, other: str) -> bool:

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags, Indices
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import Hypothesis
 from tmlattice.inference.problem import Metric, Products, effects_on_readings
@@ -32,7 +32,6 @@ class TurnMetric(Metric):
     Args:
         model, paths, launches: the trajectories.
         whitening, projection: of the data, and of the launches.
-        active: shots in which causes act, [shot].
     """
 
     def __init__(
@@ -42,26 +41,23 @@ class TurnMetric(Metric):
         launches: Array,
         whitening: Whitening,
         projection: Projection,
-        active: Flags,
     ) -> None:
         super().__init__(projection)
         self.model, self.paths, self.launches = model, paths, launches
         self.whitening = whitening
-        self.active = active
-        self.shots = np.flatnonzero(active)
-        self.weight = whitening.weight * active[:, None, None]
+        self.weight = whitening.weight
 
     # --- named hypotheses -----------------------------------------------------------------------
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """Return every signature."""
         signatures = np.nan_to_num(self.model.signatures(self.paths, hypotheses, self.launches))
-        return self.whitening.signature(signatures * self.active[:, None, None])
+        return self.whitening.signature(signatures)
 
     # --- what has no name -----------------------------------------------------------------------
     def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
-        """See `Metric`; of kicks (px, py) in each active shot, in the middle of layers' magnets."""
+        """See `Metric`; of kicks (px, py) in each shot, in the middle of layers' magnets."""
         grams, inners = [], []
-        count = max(self.chunk // len(self.shots), 1)
+        count = max(self.chunk // len(self.weight), 1)
         for start in range(0, len(layers), count):
             rows, parts = self._free_rows(layers[start : start + count], clean)
             grams.append(np.einsum("kbpr,kbqr->kbpq", rows, rows, optimize=True))
@@ -71,21 +67,25 @@ class TurnMetric(Metric):
     def _free_rows(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Whitened signatures of free kicks [layer, block, p, row], and data [block, row]."""
         kicked = self.model.kick_signatures(self.paths, layers)
-        alone = each_shot(kicked, self.shots)
+        alone = each_shot(kicked)
         rows = self.projection.out(self.whitening.signature(alone))
         return rows.reshape(len(kicked), 1, -1, len(clean)), clean[None]
 
+    @cached_property
+    def precision(self) -> Array:
+        """See `Whitening.projected_precision`."""
+        return self.whitening.projected_precision(self.projection)
+
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Information of all readings of each monitor, in every active shot and turn."""
-        precision = self.whitening.projected_precision(self.projection)
-        data = self.whitening.back(clean.reshape(self.whitening.shots, -1)[:, :-5])
-        monitors, weight = len(self.model.at), self.whitening.weight
+        """Information of all readings of each monitor, in every shot and turn."""
+        data = self.whitening.back(clean)
+        monitors, weight = len(self.model.at), self.weight
         flat = np.arange(weight.size).reshape(weight.shape)
         grams, inners = [], []
         for m in range(monitors):
-            own = flat[self.shots][:, m::monitors].ravel()
+            own = flat[:, m::monitors].ravel()
             scale = weight.ravel()[own]
-            grams.append((scale[:, None] * precision[np.ix_(own, own)] * scale)[None])
+            grams.append((scale[:, None] * self.precision[np.ix_(own, own)] * scale)[None])
             inners.append(data.ravel()[own][None])
         return np.stack(grams), np.stack(inners)
 
@@ -95,7 +95,7 @@ class SummedMetric(TurnMetric):
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
         """Put in products of single kicks and of effects on readings; return their indices."""
-        rows = self._data(data)
+        rows = self.whitening.back(data)  # for products with signatures in m
         done = (self._kicks(hypotheses, rows, found), self._readings(hypotheses, rows, found))
         return np.concatenate(done)
 
@@ -113,11 +113,6 @@ class SummedMetric(TurnMetric):
     def _slopes(self) -> Array:
         """d readings / d launch, [shot, reading, 2, n]."""
         return self.model.slopes(self.paths)
-
-    def _data(self, rows: Array) -> Array:
-        """Adjoint of `rows`: data for products with signatures in m, [data, shot, reading, 2]."""
-        parts = rows.reshape(len(rows), len(self.active), -1)[:, :, :-5]
-        return self.whitening.back(parts) * self.active[:, None, None]
 
     def _behind(self, row: Array) -> Array:
         """Data times the launches' signatures from each reading on, [shot, reading + 1, n]."""
@@ -167,7 +162,7 @@ class IndependentMetric(SummedMetric):
 
     def reading_squares(self, change: Array, at: Indices) -> tuple[Array, Array]:
         """See `SummedMetric`."""
-        shape = (len(self.active), self.model.turns, len(self.model.at), 2)
+        shape = (len(self.weight), self.model.turns, len(self.model.at), 2)
         change, Q = change.reshape(shape), self._known.reshape(*shape, -1)
         along = np.einsum("stmp,stmpq->smq", change, Q, optimize=True)
         whole = np.einsum("stmp,stmp->m", change, change)
@@ -177,19 +172,19 @@ class IndependentMetric(SummedMetric):
         """Rows of free kicks; each shot is a block, as a kick acts in its own shot."""
         kicked = self.model.kick_signatures(self.paths, layers)
         rows = self.projection.out(self.whitening.signature(kicked))
-        by_shot = rows.reshape(len(kicked), 2, len(self.active), -1).swapaxes(1, 2)
-        return by_shot[:, self.shots], clean.reshape(len(self.active), -1)[self.shots]
+        by_shot = rows.reshape(len(kicked), 2, len(self.weight), -1).swapaxes(1, 2)
+        return by_shot, clean.reshape(len(self.weight), -1)
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
         """Information by shot: a monitor's rows less their part along the launch's directions."""
-        monitors, count = len(self.model.at), len(self.active)
+        monitors, count = len(self.model.at), len(self.weight)
         rows = np.arange(self.weight[0].size).reshape(self.model.turns, monitors, 2)
         at = rows.swapaxes(0, 1).reshape(monitors, -1)  # [monitor, turn * plane]
-        weight = self.whitening.weight.reshape(count, -1)[self.shots][:, at]
-        Q = self.projection.Q[self.shots][:, at]  # [shot, monitor, p, direction]
+        weight = self.weight.reshape(count, -1)[:, at]
+        Q = self.projection.Q[:, at]  # [shot, monitor, p, direction]
         gram = np.eye(at.shape[1]) - np.einsum("smpd,smqd->smpq", Q, Q)
         gram = weight[..., :, None] * gram * weight[..., None, :]
-        inner = weight * clean.reshape(count, -1)[self.shots][:, at]
+        inner = weight * clean.reshape(count, -1)[:, at]
         return gram.swapaxes(0, 1), inner.swapaxes(0, 1)
 
 
@@ -204,12 +199,11 @@ class DenseMetric(SummedMetric):
     def _precision(self) -> Array:
         """Precision less the launches' part, in units of the noise, [monitor shot plane, same]."""
         order = np.arange(self.weight.size).reshape(self.weight.shape).swapaxes(0, 1).ravel()
-        precision = self.whitening.projected_precision(self.projection)
-        return precision[np.ix_(order, order)]
+        return self.precision[np.ix_(order, order)]
 
     def _block(self, m: int) -> Array:
         """Block of one monitor's readings, [shot plane, shot plane]."""
-        own = slice(2 * len(self.active) * m, 2 * len(self.active) * (m + 1))
+        own = slice(2 * len(self.weight) * m, 2 * len(self.weight) * (m + 1))
         return np.asarray(self._precision[own, own])
 
     @cached_property
@@ -248,10 +242,10 @@ class DenseMetric(SummedMetric):
     def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """One block for all shots: the background correlates them."""
         first, launch_kick = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
-        sums = self._behind(self._data(clean[None])[0])
-        size = 2 * len(self.shots)
+        sums = self._behind(self.whitening.back(clean))
+        size = 2 * len(self.weight)
         gram, inner = np.empty((len(layers), 1, size, size)), np.empty((len(layers), 1, size))
-        alone = each_shot(launch_kick, self.shots).reshape(len(layers), size, -1)
+        alone = each_shot(launch_kick).reshape(len(layers), size, -1)
         for k, (m, flat) in enumerate(zip(first, alone, strict=True)):
             gram[k, 0] = flat @ self._grams[m] @ flat.T
             inner[k, 0] = flat @ sums[:, m].ravel()

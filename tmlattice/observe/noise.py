@@ -5,6 +5,8 @@ each plane. The remainder has the noise of three readings with known weights; th
 monitors is robust to some errors. Two names of one signal, of monitors at one place, count once.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,10 +57,14 @@ def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def estimate(data: Data, paths: Paths) -> Array:
-    """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings."""
-    misfit = local_misfit(data, paths)
-    planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
+def estimate(several: Sequence[tuple[Data, Paths]]) -> Array:
+    """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings.
+
+    Args:
+        several: measurements with the same electronics, with the model's paths through their shots.
+    """
+    misfit = np.concatenate([local_misfit(*own).reshape(-1, 2) for own in several])
+    planes = [own[np.isfinite(own)] for own in misfit.T]
     return np.array([chi2.typical(p) if len(p) > ENOUGH else np.nan for p in planes])
 
 
@@ -69,7 +75,7 @@ PASSES = 5 + SCATTER
 """Passes from which errors of both planes are subtracted."""
 
 
-def scatter(data: Data, paths: Paths) -> Array:
+def scatter(several: Sequence[tuple[Data, Paths]]) -> Array:
     """rms noise of one reading from its scatter between shots, m, [2]; NaN with too few shots.
 
     Static errors (offsets, gains, gradients between neighbours) leave a constant in every shot, or
@@ -77,10 +83,11 @@ def scatter(data: Data, paths: Paths) -> Array:
     noise. The median over the readings is robust to a fault of some shots.
 
     Args:
-        data: several shots of one machine.
-        paths: of the model, through them.
+        several: see `estimate`.
     """
-    misfit, orbit = local_misfit(data, paths), paths.readings
+    turn = min(paths.readings.shape[1] for _, paths in several)
+    misfit = np.concatenate([local_misfit(*own)[:, :turn] for own in several])
+    orbit = np.concatenate([paths.readings[:, :turn] for _, paths in several])
     variances: list[list[float]] = [[], []]
     for plane in (0, 1):
         for i in range(1, misfit.shape[1]):

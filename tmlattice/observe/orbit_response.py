@@ -22,13 +22,14 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import Array, Flags, Reals
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.kicks import by_energy
-from tmlattice.beam.response_derivatives import ResponseSlopes
+from tmlattice.beam.kicks import by_energy, orbits_of_kicks
+from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.effects import (
     Cause,
     Hypothesis,
+    Monitors,
     ReadingEffect,
     RingEffect,
     apply,
@@ -39,8 +40,7 @@ from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference.judgement import FEW
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.stored import SMALL
+from tmlattice.observe.response_data import ResponseData, third_order
 
 DELTA = 1e-3
 """Energy step of the differences for an energy spread; its square is the unit of the fitted
@@ -177,14 +177,9 @@ class Predicted:
         It is a micrometre for an orbit of a millimetre. The closed orbits of all correctors take
         seconds, so it is computed once per step.
         """
-        data, names = self.data, self.data.measured.correctors
+        data = self.data
         kicks = data.kicks[:-1] * (1 + self.errors.calibration[:-1])
-        sides = np.concatenate([side * kicks for side in (1 / 2, -1 / 2, 1 / 4, -1 / 4)])
-        up, down, half_up, half_down = np.split(self.model.closed_orbits(names * 4, sides), 4)
-        # the linear part of both cancels: sextupoles on a large orbit have more of it than maps
-        third = (up - down - 2 * (half_up - half_down)) / (1 - 1 / 4)
-        bent = np.zeros_like(data.orbits)
-        bent[:-1] = third[:, data.at]
+        bent = third_order(self.model, data.measured.correctors, kicks, data.at)
         finite = Predicted(data, self.errors, bent)
         finite.__dict__["model"] = self.model  # the same ring
         return finite
@@ -281,9 +276,9 @@ class Predicted:
 
     def rows(
         self, pairs: Sequence[Hypothesis], block: int, shares: Array | csr_array | None = None
-    ) -> Array:
+    ) -> Reals:
         """Derivatives of a block's readings by effects on the ring, with gains alone, m, [error,
-        column, monitor].
+        column, monitor], in single precision.
 
         Args:
             pairs: (effect, place).
@@ -293,24 +288,26 @@ class Predicted:
         """
         data, slopes = self.data, self.response_slopes
         factors = slopes.factors(pairs)
-        return slopes.picked(
-            factors if shares is None else factors.combined(shares), data.at, data.plane_of(block),
-            (1 + self.errors.calibration) * data.kicks,
-            np.diagonal(self.errors.monitors, axis1=1, axis2=2),
-        )  # fmt: skip
+        factors = factors if shares is None else factors.combined(shares)
+        rows = np.empty((len(factors.before), *data.shape), dtype=np.float32)
+        for low in range(0, len(rows), slopes.at_once):
+            some = slice(low, low + slopes.at_once)
+            rows[some] = slopes.picked(
+                Factors(*(own[some] for own in factors)), data.at, data.plane_of(block),
+                (1 + self.errors.calibration) * data.kicks,
+                np.diagonal(self.errors.monitors, axis1=1, axis2=2),
+            )  # fmt: skip
+        return rows
 
     @cached_property
     def jumps(self) -> Array:
         """Beam orbit for a position jump of a metre at each corrector, [column, monitor, 2]."""
         model, data = self.model, self.data
-        columns = model.columns(data.measured.correctors)
-        jump = np.zeros((len(columns.names), model.dimension))
-        jump[np.arange(len(jump)), 2 * data.plane[:-1]] = 1
-        launch_kick = np.einsum("cij,cj->ci", model.inverse[columns.layer + 1], jump)
-        before = np.einsum("mai,ci->cma", model.reading_slopes, launch_kick @ model.closing.T)
-        behind = np.einsum("mai,ci->cma", model.reading_slopes, launch_kick)
-        whole = before + model.downstream(columns)[:, :, None] * behind
-        return np.concatenate([whole[:, data.at], np.zeros((1, len(data.at), 2))])
+        layers = model.columns(data.measured.correctors).layer
+        jump = np.eye(model.dimension)[2 * data.plane[:-1]]
+        exits, rows = model.maps.at[data.at], model.reading_slopes[data.at]
+        orbits = [orbits_of_kicks(model, layers, exits, rows[:, p], jump).T for p in (0, 1)]
+        return np.concatenate([np.stack(orbits, axis=2), np.zeros((1, len(data.at), 2))])
 
     # --- one cause more ---------------------------------------------------------------------------
     def signatures(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Array]:
@@ -345,22 +342,12 @@ class Predicted:
 
     def of_monitors(self, effect: ReadingEffect) -> Array:
         """d reading / d amount of a further effect, for every monitor, m, [column, monitor, 2]."""
-        steps = (1.0, 0.0) if effect.discrete else (SMALL * effect.largest, -SMALL * effect.largest)
-        nothing = np.zeros(2)
-        up, down = (effect.change(self.read, h) - effect.change(nothing, h) for h in steps)
-        return np.asarray((up - down) / (steps[0] - steps[1]))
+        slope, _ = effect.slopes(Monitors.perfect(len(self.errors.monitors)))
+        return np.asarray(np.einsum("mij,cmj->cmi", slope, self.read))
 
     def with_causes(self, causes: Sequence[Cause]) -> "Predicted":
         """Return the prediction with more causes, not linearised."""
         return Predicted(self.data, self.errors.with_causes(self.data, causes), self.bent)
-
-
-def bent(at: Predicted) -> Predicted:
-    """The prediction with the third order of the steps, if the ring stores a beam with each."""
-    try:
-        return at.bend()
-    except UnstableRingError:
-        return at
 
 
 def alike(
@@ -431,7 +418,7 @@ def response_change(
         energy=errors.energy,
         orbit_kicks=orbit_kicks,
     )
-    orbits = bent(Predicted(there, Errors.none(there))).straight + change
+    orbits = Predicted(there, Errors.none(there), there.bent).straight + change
     rf = before.measured.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=orbits[-1])

@@ -16,6 +16,7 @@ The split has readings to fit, to select families, and to validate.
 >>> split.held.sum()                               # number of held-out correctors
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -67,8 +68,20 @@ class ResponseData:
     @cached_property
     def design(self) -> ResponseModel:
         """Model of the design; UnstableRingError without a closed orbit."""
-        model = ResponseModel(self.ring, orbit_kicks=self.orbit_kicks)
+        if self.orbit_kicks is None:
+            model = ResponseModel.of(self.ring)
+        else:
+            model = ResponseModel(self.ring, orbit_kicks=self.orbit_kicks)
         return model.at_energy(self.energy) if self.energy else model
+
+    @cached_property
+    def bent(self) -> Array | float:
+        """Third order of the steps in the design, m, [column, monitor, 2]; 0 if no beam is stored
+        with each."""
+        try:
+            return third_order(self.design, self.measured.correctors, self.kicks[:-1], self.at)
+        except UnstableRingError:
+            return 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -87,6 +100,29 @@ class ResponseData:
     def noise_of(self, block: int) -> Array:
         """Noise rms of each reading, m, [column, monitor]."""
         return np.asarray(self.noise[:, self.plane_of(block)].T)
+
+
+def third_order(
+    model: ResponseModel, correctors: Sequence[str], kicks: Array, at: Indices
+) -> Array:
+    """Return the third order of two-sided steps of correctors, m, [column, monitor, 2]; 0 in the
+    last column, the RF's.
+
+    Args:
+        model: of the ring.
+        correctors: their names.
+        kicks: the whole steps, rad, [corrector].
+        at: indices of the monitors.
+
+    Raises:
+        UnstableRingError: no beam is stored with a step.
+    """
+    sides = np.concatenate([side * kicks for side in (1 / 2, -1 / 2, 1 / 4, -1 / 4)])
+    orbits = model.closed_orbits([*correctors] * 4, sides)[:, at]
+    up, down, half_up, half_down = np.split(orbits, 4)
+    # the linear part of both cancels: sextupoles on a large orbit have more of it than maps
+    third = (up - down - 2 * (half_up - half_down)) / (1 - 1 / 4)
+    return np.concatenate([third, np.zeros((1, *third.shape[1:]))])
 
 
 def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:

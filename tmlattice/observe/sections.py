@@ -11,13 +11,13 @@ second-order ones, and truncated: over a part of a turn the lost third order is 
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices, finite
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
@@ -166,15 +166,15 @@ def mean_pass(values: Array, there: Flags) -> Array:
 
 def scaled(covariance: Array) -> tuple[Array, Array]:
     """Standard deviations [..., n], and the correlations of covariances [..., n, n]."""
-    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), TINY))
+    size = np.sqrt(np.maximum(finite(np.einsum("...ii->...i", covariance)), TINY))
     even = covariance / size[..., None] / size[..., None, :]
-    return size, np.nan_to_num(even, posinf=0, neginf=0)
+    return size, finite(even, posinf=0, neginf=0)
 
 
 def distance(miss: Array, covariance: Array) -> Array:
     """Mean square of a mismatch in units of its covariance, [...]."""
     size, even = scaled(covariance)
-    miss = np.clip(np.nan_to_num(miss / size, nan=DIVERGED_SIGMA), -DIVERGED_SIGMA, DIVERGED_SIGMA)
+    miss = np.clip(finite(miss / size, nan=DIVERGED_SIGMA), -DIVERGED_SIGMA, DIVERGED_SIGMA)
     solved = np.linalg.solve(even + INVISIBLE * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
 
@@ -182,10 +182,50 @@ def distance(miss: Array, covariance: Array) -> Array:
 def log_uncertainty(covariance: Array) -> float:
     """Sum of the log root determinants of covariances [..., n, n]."""
     limit = DIVERGED_SIGMA**2
-    covariance = np.nan_to_num(covariance, nan=limit, posinf=limit, neginf=-limit)
+    covariance = finite(covariance, nan=limit, posinf=limit, neginf=-limit)
     sign, log = np.linalg.slogdet(covariance)
     diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), TINY)).sum(axis=-1)
     return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: use the diagonal
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """What the trajectories of some measurements are fitted to.
+
+    Attributes:
+        maps: to the monitors of each section, [measurement, pass, section, monitor].
+        data, sigma, there: readings and their noise, m, and whether they were measured,
+            [measurement, pass, section, monitor, 2].
+        prior: precision of each coordinate, [measurement, pass, section, 4].
+        freedom: [measurement, pass, section].
+        delta, group: expected energy, and index of the settings, [measurement, pass].
+        alone: see `Passes`, [measurement].
+    """
+
+    maps: Quadratic
+    data: Array
+    sigma: Array
+    there: Flags
+    prior: Array
+    freedom: Indices
+    delta: Array
+    alone: Flags
+    group: Places
+
+    def __getitem__(self, which: Flags) -> "_Fitted":
+        """Some of the measurements."""
+        return _Fitted(*(getattr(self, own.name)[which] for own in fields(self)))
+
+    def linearised(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Residuals of trajectories x [measurement, pass, section, 5], in units of the noise, their
+        slopes by these and by the energy, [..., reading (, 4)], and the normal equations."""
+        image, slope = self.maps(x[..., None, :])
+        left = np.where(self.there, (self.data - image) / self.sigma, 0.0)
+        left = left.reshape(*x.shape[:-1], -1)
+        A = (slope[..., :4] / self.sigma[..., None]).reshape(*left.shape, 4)
+        curvature = np.swapaxes(A, -1, -2) @ A + self.prior[..., None] * np.eye(4)
+        own = (slope[..., 4] / self.sigma).reshape(left.shape)
+        return left, A, own, _regularised(curvature)
 
 
 class Sections:
@@ -294,44 +334,48 @@ class Sections:
         prior = _prior_precision(read, maps.R, padded, count)
         x = np.zeros((*shape, 5))
         x[..., 4] = delta[..., None]
-        moved, by_energy = np.full(len(several), np.inf), np.zeros((*shape, 4))
+        by_energy = np.zeros((*shape, 4))
         alone = np.array([own.alone for own in several])
+        section = np.arange(W)
+        every = _Fitted(maps, data, sigma, there, prior, freedom, delta, alone, group)
+        rest, on = every, np.arange(len(several))  # those that go on
         with np.errstate(all="ignore"):
-            for step in range(ROUNDS):
-                image, slope = maps(x[..., None, :])
-                left = np.where(there, (data - image) / sigma, 0.0).reshape(*shape, -1)
-                A = (slope[..., :4] / sigma[..., None]).reshape(*shape, -1, 4)
-                curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
-                going = moved > SETTLED  # the others stay as they are
-                if step == ROUNDS - 1 or not going.any():
-                    break
-                own = (slope[..., 4] / sigma).reshape(*shape, -1)  # by the energy
+            for _ in range(ROUNDS - 1):
+                here = x[on]
+                left, A, own, curvature = rest.linearised(here)
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
-                pull = np.linalg.solve(curvature, (prior * x[..., :4])[..., None])
+                pull = np.linalg.solve(curvature, (rest.prior * here[..., :4])[..., None])
                 step_4 = (back @ left[..., None] - pull)[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
                 drift = -(back @ own[..., None])[..., 0]  # of the trajectories, by the energy
-                inner = _energy_terms(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
-                ends = way[group[..., None], np.arange(W)](x)
-                outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
-                change, known = _common_energy(inner, outer, delta - x[..., 0, 4], alone)
+                unfitted = left - fitted
+                off_energy = own + (A @ drift[..., None])[..., 0]
+                inner = _energy_terms(unfitted, off_energy, rest.freedom)
+                ends = way[rest.group[..., None], section](here)
+                outer = _joints(here[..., :4], ends, step_4, drift, _inverse(curvature))
+                expected = rest.delta - here[..., 0, 4]
+                change, known = _common_energy(inner, outer, expected, rest.alone)
                 error = np.sqrt(known)
-                by_energy[going] = (drift / error[..., None, None])[going]
-                now = np.maximum(_median(np.abs(fitted)), np.nanmax(np.abs(change) * error, 1))
-                now /= np.maximum(1.0, _median(np.abs(left - fitted)))
-                moved[going] = now[going]
+                by_energy[on] = drift / error[..., None, None]
+                moved = np.maximum(_median(np.abs(fitted)), np.nanmax(np.abs(change) * error, 1))
+                moved /= np.maximum(1.0, _median(np.abs(unfitted)))
                 step_4 = step_4 + drift * change[..., None, None]
-                ahead = np.clip(x[..., :4] + np.nan_to_num(step_4), -FARTHEST, FARTHEST)
-                x[going, ..., :4] = ahead[going]
-                x[going, ..., 4] += change[going, :, None]
-        whole: Array = np.nan_to_num(
+                x[on, ..., :4] = np.clip(here[..., :4] + finite(step_4), -FARTHEST, FARTHEST)
+                x[on, ..., 4] += change[..., None]
+                going = moved > SETTLED
+                if not going.any():
+                    break
+                if not going.all():
+                    on, rest = on[going], rest[going]
+            left, A, _, curvature = every.linearised(x)
+        whole: Array = finite(
             (left**2).sum(axis=-1), nan=DIVERGED_SIGMA**2, posinf=DIVERGED_SIGMA**2
         )
         covariance = _inverse(curvature)
-        end, slope = way[group[..., None], np.arange(W)](x)
+        end, slope = way[group[..., None], section](x)
         J = slope[..., :4, :4]
         fullest = there.sum(axis=(-2, -1)).argmax(axis=1)  # the pass of each section
-        most = np.arange(len(several))[:, None], fullest, np.arange(W)
+        most = np.arange(len(several))[:, None], fullest, section
         own = np.where(padded[:, :, None, None], kicks[np.where(padded, owner, 0)], 0.0)
         behind = np.tril(np.ones((width, width)), -1)[:, None, :, None]  # reading, kick
         kicked = np.einsum("swkpi,wmiq->swkpmq", maps.R[most][..., :4], own) * behind
@@ -348,7 +392,7 @@ class Sections:
             "delta": x[..., 0, 4],
             "start": x[..., :4],
             "covariance": covariance,
-            "energy": np.nan_to_num(by_energy),
+            "energy": finite(by_energy),
             "end": end[..., :4],
             "carried": J @ covariance @ np.swapaxes(J, -1, -2),
             "kicked": kicked - A[most] @ moved_start,
@@ -369,8 +413,8 @@ class Sections:
         for w, members in enumerate(self._members):
             read[:, members] = seen[group[:, None], members](x[:, None])[0]
             ends = np.clip(way[group, w](x)[0][:, :4], -FARTHEST, FARTHEST)
-            x = np.concatenate([np.nan_to_num(ends), x[:, 4:]], axis=1)
-        return np.clip(np.nan_to_num(read), -FARTHEST, FARTHEST)
+            x = np.concatenate([finite(ends), x[:, 4:]], axis=1)
+        return np.clip(finite(read), -FARTHEST, FARTHEST)
 
     def carried(self, launches: Array, shot: Places, turns: int) -> tuple[Array, Array]:
         """Launches [pass, 5] of shots after whole turns, and the slopes [pass, 4, 4]."""
@@ -387,11 +431,13 @@ class Sections:
 def _median(values: Array) -> Array:
     """Median of the numbers of each measurement, [measurement]; 0 if there are none."""
     flat = values.reshape(len(values), -1)
-    some = ~np.isnan(flat).all(axis=1)
-    found = np.zeros(len(values))
-    if some.any():
-        found[some] = np.nanmedian(flat[some], axis=1)
-    return found
+    if not flat.size:
+        return np.zeros(len(flat))
+    count = np.count_nonzero(~np.isnan(flat), axis=1)
+    ordered = np.sort(flat, axis=1)  # NaN last; `numpy.nanmedian` takes ten times longer
+    which = np.arange(len(flat))
+    middle = (ordered[which, (count - 1) // 2] + ordered[which, count // 2]) / 2
+    return np.where(count > 0, middle, 0.0)
 
 
 EnergyTerms = tuple[Array, Array, Array]
@@ -411,10 +457,10 @@ def _joints(
     J = ends[1][..., :4, :4]
     end = ends[0][..., :4] + (J @ step[..., None])[..., 0]
     pushed = (J @ drift[..., None])[..., 0] + ends[1][..., :4, 4]
-    miss = np.nan_to_num((start + step)[..., 1:, :] - end[..., :-1, :])
-    slope = np.nan_to_num(drift[..., 1:, :] - pushed[..., :-1, :])
+    miss = finite((start + step)[..., 1:, :] - end[..., :-1, :])
+    slope = finite(drift[..., 1:, :] - pushed[..., :-1, :])
     carried = J @ covariance @ np.swapaxes(J, -1, -2)
-    spread = np.nan_to_num(covariance[..., 1:, :, :] + carried[..., :-1, :, :])
+    spread = finite(covariance[..., 1:, :, :] + carried[..., :-1, :, :])
     size, even = scaled(spread)
     right = np.stack([miss / size, slope / size], axis=-1)
     both = np.linalg.solve(even + INVISIBLE * np.eye(4), right)
@@ -442,8 +488,8 @@ def _common_energy(
         there = np.isfinite(misfit)
         level = np.maximum(_median(np.where(there, misfit, np.nan)), 1.0)
         weight = np.where(there, 1 / np.maximum(misfit, level[:, None, None]), 0.0)
-        asked = asked + np.nan_to_num(weight * right).sum(axis=-1)
-        known = known + np.nan_to_num(weight * left).sum(axis=-1)
+        asked = asked + finite(weight * right).sum(axis=-1)
+        known = known + finite(weight * left).sum(axis=-1)
     asked, known = (
         np.where(alone[:, None], own, own.sum(axis=1, keepdims=True)) for own in (asked, known)
     )
@@ -480,5 +526,5 @@ def _regularised(curvature: Array) -> Array:
     scale = np.where(np.isfinite(scale), scale, 0.0)
     largest = np.maximum(scale.max(axis=-1, keepdims=True), TINY)
     scale = np.maximum(scale, 1e-2 * largest)
-    held = np.nan_to_num(curvature, posinf=0.0, neginf=0.0)
+    held = finite(curvature, posinf=0.0, neginf=0.0)
     return np.asarray(held + WEAK * scale[..., None] ** 2 * np.eye(4))

@@ -215,9 +215,6 @@ class SteadyMetric(Metric):
         return gram, inner
 
 
-SMALL = 1e-3
-"""Step of the differences, as a share of a monitor's largest error."""
-
 MAX_CHANGES = 10
 """Causes up to which a model is changed from the one without; with more it is cached."""
 
@@ -409,16 +406,7 @@ class Stored(Steady):
             return self.readings_of(
                 [seen_by(one, matrix) for one in self.one_turn_later(own)], nuisances
             )
-        high = 1.0 if effect.discrete else SMALL * effect.largest
-        low = 0.0 if effect.discrete else -high
-        ends = []
-        for amount in (high, low):
-            monitors = view.monitors.copy()
-            if amount:
-                effect.set(monitors, slice(None), amount)
-            ends.append((monitors.matrix(), monitors.constant()))
-        (upper, up), (lower, down) = ends
-        slope, constant = ((a - b) / (high - low) for a, b in ((upper, lower), (up, down)))
+        slope, constant = effect.slopes(view.monitors)
         return self.readings_of(
             [seen_by(one, slope, constant, tunes=0.0) for one in own], nuisances
         )

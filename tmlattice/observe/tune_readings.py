@@ -55,7 +55,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     """
     shots = len(measured.tune)
     states = states_of(measured.settings, shots)
-    model = ResponseModel(ring)
+    model = ResponseModel.of(ring)
     step = abs(DELTA / model.rf_start[5])
     # delta is the relative deviation of the momentum, p that of the energy over p0 c: beta delta
     energies = 2 * step * float(model.rf_start[5]) / ring.beta

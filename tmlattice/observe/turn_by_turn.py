@@ -433,28 +433,27 @@ class ManyTurns(Stored):
         ones = nuisances.copy()
         ones[..., :2] = 1.0, 0.0
         shots = len(ones)
+        each = np.arange(shots)  # has its own nuisances
         at_one = self.read(view, ones)
         lines = at_one[:, :LINES].reshape(shots, -1, 2, 2)  # [shot, , mode, re and im]
+        turned = np.stack([-lines[..., 1], lines[..., 0]], axis=-1)
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
         out = np.zeros((shots, 2, 2 + OTHERS, shots, lines.shape[1], 2, 2))
         rest = np.zeros((shots, 2, 2 + OTHERS, shots, -LINES))
+        for mode in range(2):
+            out[each, mode, 0, each, :, mode] = lines[:, :, mode]
+            out[each, mode, 1, each, :, mode] = turned[:, :, mode]
         for other in range(OTHERS):
             more = ones.copy()
             more[..., 2 + other] += 1.0
             change = self.read(view, more) - at_one
             by = change[:, :LINES].reshape(lines.shape)
             moved = (by[..., 0] + 1j * by[..., 1]) * size[:, None]
-            for shot in range(shots):
-                for mode in range(2):
-                    own = moved[shot, :, mode]
-                    out[shot, mode, 2 + other, shot, :, mode] = np.stack([own.real, own.imag], 1)
-                    here = [OTHERS * mode + other, 2 * OTHERS + mode]
-                    rest[shot, mode, 2 + other, shot, here] = change[shot, LINES:][here]
-        for shot in range(shots):
+            parts = np.stack([moved.real, moved.imag], axis=-1)
             for mode in range(2):
-                own = lines[shot, :, mode]
-                out[shot, mode, 0, shot, :, mode] = own
-                out[shot, mode, 1, shot, :, mode] = np.stack([-own[:, 1], own[:, 0]], axis=1)
+                out[each, mode, 2 + other, each, :, mode] = parts[:, :, mode]
+                for own in (OTHERS * mode + other, 2 * OTHERS + mode):
+                    rest[each, mode, 2 + other, each, own] = change[:, LINES + own]
         flat = out.reshape(nuisances.size, shots, -1)
         return np.concatenate([flat, rest.reshape(nuisances.size, shots, -1)], axis=2)
 

@@ -1,6 +1,7 @@
 """Figures of a diagnosis."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from textwrap import wrap
 
 import matplotlib.pyplot as plt
@@ -24,7 +25,7 @@ from tmlattice.plots.readings import (
     readings_caption,
 )
 from tmlattice.plots.response import response_figures
-from tmlattice.plots.strip import GRID, above_strip, lattice_strip, legend_above
+from tmlattice.plots.strip import GRID, Drawable, above_strip, lattice_strip, legend_above
 from tmlattice.speaks import micrometres
 
 STYLES: Mapping[str, tuple[str, str]] = {
@@ -44,52 +45,62 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
-    yield "plan", "The ring from above, with the findings.", _figure(plot_plan(diagnosis))
+    for name, caption, draw in drawable(diagnosis):
+        yield name, caption, drawn(draw)
+
+
+def drawn(draw: Callable[[], Figure | Axes]) -> Figure:
+    """The figure that a function draws."""
+    made = draw()
+    figure = made if isinstance(made, Figure) else made.figure
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def drawable(diagnosis: Diagnosis) -> Iterator[Drawable]:
+    """Every figure that a diagnosis has: (name, caption, function that draws it)."""
+    yield "plan", "The ring from above, with the findings.", lambda: plot_plan(diagnosis)
     yield from (response_figures if diagnosis.by_families else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.recommended_actions) > 1:
             yield (
                 f"credible-set-{number}",
                 f"Explanations of finding {number} that the data do not exclude.",
-                _figure(plot_credible_set(finding)),
+                partial(plot_credible_set, finding),
             )
 
 
-def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
+def _searched_figures(diagnosis: Diagnosis) -> Iterator[Drawable]:
+    first = None if diagnosis.stored else clearest(diagnosis)
     if not diagnosis.stored:
-        yield from _of_readings(diagnosis)
-    if diagnosis.heldout is not None:
+        if not diagnosis.parts:
+            yield "readings", readings_caption(diagnosis), lambda: plot_readings(diagnosis)
+        elif parts_along(diagnosis):
+            yield (
+                "readings",
+                "Residual at each BPM in units of the noise, of each measurement, with the "
+                "design and with the findings.",
+                lambda: plot_parts(diagnosis),
+            )
         yield (
-            "gap",
-            "Readings of shots that the fit never saw less the model, as findings are added.",
-            _figure(plot_gap(diagnosis)),
+            "scan",
+            "How much better each hypothesis alone explains the data: the decrease of chi-square, "
+            "before any finding. Above the dashed line it is no accident of the noise "
+            "anywhere in the scan.",
+            lambda: plot_scan(diagnosis),
         )
-
-
-def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
-    if not diagnosis.parts:
-        yield "readings", readings_caption(diagnosis), plot_readings(diagnosis)
-    elif parts_along(diagnosis):
-        yield (
-            "readings",
-            "Residual at each BPM in units of the noise, of each measurement, with the "
-            "design and with the findings.",
-            plot_parts(diagnosis),
-        )
-    yield (
-        "scan",
-        "How much better each hypothesis alone explains the data: the decrease of chi-square, "
-        "before any finding. Above the dashed line it is no accident of the noise "
-        "anywhere in the scan.",
-        plot_scan(diagnosis),
-    )
-    first = clearest(diagnosis)
     if first is not None:
         yield (
             "scan-near",
             "The same scan around the clearest finding, linear, with the BPMs. Later findings "
             "show only once this one is in the model.",
-            plot_scan_near(diagnosis, first),
+            partial(plot_scan_near, diagnosis, first),
+        )
+    if diagnosis.heldout is not None:
+        yield (
+            "gap",
+            "Readings of shots that the fit never saw less the model, as findings are added.",
+            lambda: plot_gap(diagnosis),
         )
 
 
@@ -99,12 +110,6 @@ def clearest(diagnosis: Diagnosis) -> Finding | None:
     if first is None or first.where is None or np.ptp(first.where) >= WIDE:
         return None
     return first
-
-
-def _figure(ax: Axes) -> Figure:
-    figure = ax.figure
-    assert isinstance(figure, Figure)
-    return figure
 
 
 # --- the scan -------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ def models_of(diagnosis: Diagnosis) -> dict[str, tuple[Array, str]]:
 def worst_shot(diagnosis: Diagnosis, model: Array) -> int:
     """The shot of the fit with the largest residual of a model, [shot, reading, 2], m."""
     data = diagnosis.trajectories.data
-    left = np.where(data.valid, data.readings - model, 0.0) ** 2 * data.active[:, None, None]
+    left = np.where(data.valid, data.readings - model, 0.0) ** 2
     return int(np.nan_to_num(left).sum(axis=(1, 2)).argmax())
 
 

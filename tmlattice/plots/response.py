@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from textwrap import wrap
-from typing import cast
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,7 +13,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import with_labels
 from tmlattice.lattice import Element
 from tmlattice.optics import Twiss, twiss
-from tmlattice.plots.strip import GRID, above_strip, plain_log
+from tmlattice.plots.strip import GRID, Drawable, above_strip, plain_log
 
 RESIDUALS = (
     ("heldout_rms_in_plane", "in-plane", "C0", "o"),
@@ -41,28 +40,29 @@ def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
     ]
 
 
-def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
-    """Every figure: (name, caption, figure); close each after use."""
+def response_figures(result: Diagnosis) -> Iterator[Drawable]:
+    """Every figure: (name, caption, function that draws it)."""
     if not result.stored:
         yield (
             "maps",
             "Orbit change by corrector and BPM, each corrector in its own plane: measured, and "
             f"residuals of the {result.starting_model} and the result. Grey: rejected or held out.",
-            plot_maps(result),
+            lambda: plot_maps(result),
         )
     yield (
         "steps",
         "The gap on held-out readings before and after, and with the decision on one family of "
         "errors reversed; vertical lines: of the hierarchical fit.",
-        cast(Figure, plot_steps(result).figure),
+        lambda: plot_steps(result),
     )
     if gradient_errors(result):
         yield (
             "gradients",
             "Gradient error of each quadrupole along the ring, with its posterior rms.",
-            plot_gradients(result),
+            lambda: plot_gradients(result),
         )
-        yield ("beta-beat", "Beta of the result relative to the design's.", plot_beta_beat(result))
+        caption = "Beta of the result relative to the design's."
+        yield "beta-beat", caption, lambda: plot_beta_beat(result)
 
 
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:

@@ -22,7 +22,7 @@ from tmlattice.measurement import (
     in_words,
 )
 from tmlattice.optics import twiss
-from tmlattice.plots.diagnosis import figures
+from tmlattice.plots.diagnosis import drawable, drawn
 from tmlattice.plots.optics import plot_betas
 from tmlattice.plots.strip import GRID, above_strip, legend_above
 
@@ -48,20 +48,13 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
     Raises:
         ChoiceError: no such figure; names those that there are.
     """
-    found: dict[str, Figure] = {}
-    wanted = name or ("maps" if diagnosis.by_families else "scan")
-    for own, _, figure in figures(diagnosis):
-        found[own] = figure
-        if own == wanted:
-            break
-    chosen = found.pop(wanted, None)
-    for figure in found.values():
-        plt.close(figure)
-    if chosen is not None:
-        return chosen
-    if name is None:  # a kind without a scan: its first
-        return next(iter(figures(diagnosis)))[2]
-    raise unknown_choice("figure", name, found)
+    known = [own for own, *_ in drawable(diagnosis)]
+    if name is None:  # of a kind without a scan: its first
+        usual = "maps" if diagnosis.by_families else "scan"
+        name = usual if usual in known else known[0]
+    if name not in known:
+        raise unknown_choice("figure", name, known)
+    return drawn(next(draw for own, _, draw in drawable(diagnosis) if own == name))
 
 
 def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = None) -> Figure:

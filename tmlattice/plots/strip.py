@@ -1,6 +1,6 @@
 """The lattice strip under anything that is plotted against s."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ COLOURS = {
 
 GRID = 0.25
 """Opacity of a grid."""
+Drawable = tuple[str, str, Callable[[], Figure | Axes]]
+"""Name and caption of a figure, and the function that draws it."""
 METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
 """Colours of the methods of a fit, in every figure."""
 

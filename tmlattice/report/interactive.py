@@ -6,7 +6,7 @@ or where scripts are off. The colours "@ink" and "@faint" follow the reader's li
 >>> figures(diagnosis)["scan"]["layout"]["xaxis"]["title"]["text"]
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -14,9 +14,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike
 
-from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import find
 from tmlattice.lattice import Ring
 from tmlattice.lattice.survey import survey
@@ -27,6 +25,7 @@ from tmlattice.plots.diagnosis import (
     STYLES,
     around,
     clearest,
+    drawable,
     free_kicks,
     gap_labels,
     middles,
@@ -52,30 +51,14 @@ MOST = 4000
 
 
 def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
-    """Figure functions by the name of the picture in `plots.diagnosis.figures`."""
-    made = {"plan": plan(diagnosis)}
-    if not diagnosis.by_families:
-        if not diagnosis.stored:
-            made |= _of_readings(diagnosis)
-        if diagnosis.heldout is not None:
-            made["gap"] = gap(diagnosis)
-        return made
-    made["steps"] = steps(diagnosis)
-    if gradient_errors(diagnosis):
-        made |= {"gradients": gradients(diagnosis), "beta-beat": beta_beat(diagnosis)}
-    return made
-
-
-def _of_readings(diagnosis: Diagnosis) -> dict[str, Figure]:
-    made = {"scan": scan(diagnosis)}
-    if not diagnosis.parts:
-        made["readings"] = readings(diagnosis)
-    elif shown := parts_along(diagnosis):
-        made["readings"] = parts(diagnosis, shown)
-    first = clearest(diagnosis)
-    if first is not None:
-        made["scan-near"] = scan(diagnosis, around(diagnosis, first))
-    return made
+    """Figures by the name of the picture in `plots.diagnosis.figures`."""
+    made: dict[str, Callable[[Diagnosis], Figure]] = {
+        "plan": plan, "scan": scan, "readings": parts if diagnosis.parts else readings,
+        "scan-near": scan_near, "gap": gap, "steps": steps, "gradients": gradients,
+        "beta-beat": beta_beat,
+    }  # fmt: skip
+    names = {name for name, *_ in drawable(diagnosis)}
+    return {name: figure(diagnosis) for name, figure in made.items() if name in names}
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -271,8 +254,9 @@ def readings(diagnosis: Diagnosis) -> Figure:
     return {"data": traces, "layout": layout, "strip": "y3"}
 
 
-def parts(diagnosis: Diagnosis, shown: Sequence[tuple[PartView, Array]]) -> Figure:
+def parts(diagnosis: Diagnosis) -> Figure:
     """Residuals of each measurement at each BPM in units of the noise, before and after."""
+    shown = parts_along(diagnosis)
     height = 0.9 / len(shown)
     traces, axes = [], {}
     for k, (part, s) in enumerate(shown):
@@ -346,6 +330,13 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
         layout["xaxis"]["range"] = [low, high]
         layout["yaxis"] = _axis("Δχ²", domain=[0.13, 1], rangemode="tozero")
     return {"data": traces, "layout": layout, "strip": "y2"}
+
+
+def scan_near(diagnosis: Diagnosis) -> Figure:
+    """The scan around the clearest finding."""
+    first = clearest(diagnosis)
+    assert first is not None
+    return scan(diagnosis, around(diagnosis, first))
 
 
 def gap(diagnosis: Diagnosis) -> Figure:

@@ -13,6 +13,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tmlattice.correction import Correction
@@ -25,6 +26,7 @@ from tmlattice.report.interactive import figures, strip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +75,7 @@ def save(
     its caption and its `source`, see `_source`."""
     import matplotlib.pyplot as plt
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     pictures = []
     for name, caption, figure in figures:
@@ -80,9 +83,10 @@ def save(
         _no_formulas(figure)
         canvas = FigureCanvasAgg(figure)
         figure.set_dpi(DPI)
-        canvas.print_png(path)  # type: ignore[no-untyped-call]  # `savefig` draws twice
+        canvas.draw()  # type: ignore[no-untyped-call]  # `savefig` draws twice
+        drawn = canvas.buffer_rgba()  # type: ignore[no-untyped-call]
+        _write(Image.fromarray(np.asarray(drawn)), path, caption, source)
         plt.close(figure)
-        shrink(path, caption, source)
         pictures.append(Picture(name, caption, path))
     return pictures
 
@@ -101,19 +105,26 @@ def _no_formulas(figure: "Figure") -> None:
             formatter.seq = [str(text).replace("$", r"\$") for text in formatter.seq]
 
 
-def shrink(path: Path, caption: str, source: str = "") -> None:
-    """Write a PNG file with a palette, a third as large, with texts for a report that is rendered
-    again; rare colours are kept."""
+def shrink(path: Path, caption: str) -> None:
+    """Write a PNG file with a palette, a third as large, and its caption."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        _write(picture, path, caption, "")
+
+
+def _write(picture: "Image", path: Path, caption: str, source: str) -> None:
+    """Write a PNG file with a palette, and with texts for a report that is rendered again; rare
+    colours are kept."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     about = PngInfo()
     about.add_itxt("Description", caption)
     about.add_itxt("Source", source)
-    with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(
-            method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-        )
+    few = picture.convert("RGB").quantize(
+        method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+    )
     few.save(path, optimize=True, pnginfo=about)
 
 

@@ -32,15 +32,12 @@ SCORES = ("amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi²")
 
 
 def _scores(step: Step) -> tuple[str, ...]:
-    return (
-        str(step.parameters),
-        three_digits(step.heldout_rms_in_plane),
-        three_digits(step.heldout_rms_position),
-        three_digits(step.heldout_rms_coupling),
-        three_digits(step.heldout_rms_roll),
-        three_digits(step.dispersion_rms),
-        known(step.heldout_chi2_per_dof),
-    )
+    lengths = (
+        step.heldout_rms_in_plane, step.heldout_rms_position, step.heldout_rms_coupling,
+        step.heldout_rms_roll, step.dispersion_rms,
+    )  # fmt: skip
+    in_micrometres = (known(1e6 * length) for length in lengths)
+    return str(step.parameters), *in_micrometres, known(step.heldout_chi2_per_dof)
 
 
 def family_rows(families: Iterable[Step]) -> list[tuple[str, ...]]:
@@ -48,11 +45,6 @@ def family_rows(families: Iterable[Step]) -> list[tuple[str, ...]]:
     it, parameters, held-out rms in µm."""
     rows = [(f.reversed_decision, known(f.log_evidence), *_scores(f)) for f in families]
     return [("reversed decision", "log evidence", *SCORES), *rows]
-
-
-def three_digits(metres: float) -> str:
-    """A length in µm with three digits; empty where nothing was read."""
-    return known(1e6 * metres)
 
 
 def known(value: float) -> str:

@@ -43,11 +43,9 @@ def write_files(
 ) -> None:
     """Write the files of `save` for a given document, with the settings of a correction."""
     pictures = draw(diagnosis, folder, correction)
-    html = page(diagnosis, pictures, document["provenance"], correction)
     if correction is not None:
         write_settings(correction, folder)
-    (folder / "report.html").write_text(html, encoding="utf-8")
-    (folder / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
+    _write_report(diagnosis, folder, page(diagnosis, pictures, document["provenance"], correction))
     write_json(folder / DOCUMENT, document)
     with suppress(LatticeError):  # an element that no file holds: `load` then asks for the ring
         save_ring(diagnosis.ring, folder / LATTICE)
@@ -83,10 +81,13 @@ def render(
         pictures = draw(diagnosis, temporary, correction)
         drawn = {picture.name for picture in pictures}
         pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
-        html = page(diagnosis, pictures, correction=correction)
-        (temporary / "report.html").write_text(html, encoding="utf-8")
-        (temporary / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
+        _write_report(diagnosis, temporary, page(diagnosis, pictures, correction=correction))
     return diagnosis
+
+
+def _write_report(diagnosis: Diagnosis, folder: Path, html: str) -> None:
+    (folder / "report.html").write_text(html, encoding="utf-8")
+    (folder / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
 
 
 def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:

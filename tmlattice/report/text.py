@@ -292,7 +292,8 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 def _misfit_text(misfit: Misfit) -> str:
     size = f"{micrometres(misfit.rms)}, " if np.isfinite(misfit.rms) else ""
-    return f"{size}chi² {_chi2(misfit.chi2_per_dof)}"
+    chi2 = misfit.chi2_per_dof
+    return f"{size}chi² " + (f"{chi2:.2f}" if chi2 < 100 else f"{chi2:.3g}")
 
 
 def heldout_text(diagnosis: Diagnosis) -> str:
@@ -302,10 +303,6 @@ def heldout_text(diagnosis: Diagnosis) -> str:
     if not diagnosis.by_families:
         return "at half of the BPMs"
     return f"{diagnosis.correctors_held_out} correctors"
-
-
-def _chi2(value: float) -> str:
-    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
 def noise_text(diagnosis: Diagnosis) -> str:

@@ -37,7 +37,6 @@ class MapFit:
         residuals: observations less the network's, [step, observed].
         covariance: of (free weights, free start coordinates), at the noise given.
         free: which of the map's weights moved, [n, monomial], in the order of `weights_of`.
-        evaluations: of the whole solution.
     """
 
     taylor_map: TaylorMap
@@ -45,7 +44,6 @@ class MapFit:
     residuals: Array
     covariance: Array
     free: Bools
-    evaluations: int
 
     def error_of(self, quantity: Callable[[TaylorMap], float]) -> float:
         """Standard error of a number that is computed from the map, by its linear propagation."""
@@ -187,4 +185,4 @@ def fit_map(
     kept = singular > 1e-13 * singular[0]
     covariance = (axes[kept].T / singular[kept] ** 2) @ axes[kept]
     left = y - follow(learned, begun, len(y) - 1)[:, columns]
-    return MapFit(learned, begun, left, covariance, mask, int(found.nfev))
+    return MapFit(learned, begun, left, covariance, mask)

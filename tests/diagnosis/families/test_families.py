@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from shared import small_steps
+from shared import parted, small_steps
 
 from tmlattice.diagnosis.families.fields import (
     CorrectorPosition,
@@ -26,7 +26,7 @@ from tmlattice.effects import Cause
 from tmlattice.lattice.ring import Element, Ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import response_data
 
 CALIBRATION, GAIN = CorrectorCalibration(), MonitorGain()
 RMS = {
@@ -125,9 +125,9 @@ def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(
     for by in (0.015, -0.015):
         causes = [Cause("corrector_position", name, by) for name in names]
         measured = small_steps(small_ring, causes, seed=2, engine="at")
-        data = response_data(small_ring, measured)
+        data, split = parted(small_ring, measured)
         assert [list(own) for own in family.shares(data)] == [names]
-        state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
+        state = begin(data, split)
         (found,) = settle(jump(allow(state, [family]))).values[family.variable]
         assert abs(found - by) < 1e-3
 
@@ -136,8 +136,7 @@ def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(
 def test_the_beams_energy_comes_out_as_at_has_it(small_ring, by):
     """AT's closed orbits at the RF frequency of that energy."""
     measured = small_steps(small_ring, [Cause("energy_offset", None, by)], seed=2, engine="at")
-    data = response_data(small_ring, measured)
-    state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
+    state = begin(*parted(small_ring, measured))
     (found,) = settle(allow(state, [EnergyOffset()])).values["energy"]
     assert abs(found - by) < 0.01 * abs(by)
 

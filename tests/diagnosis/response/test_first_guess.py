@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from shared import small_steps
+from shared import parted, small_steps
 
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.diagnosis.families.steps import STEPS
@@ -14,7 +14,6 @@ from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.observe.compared import ANOTHER, OfResponse
-from tmlattice.observe.response_data import response_data, split_columns
 
 NOISE = 2e-8
 
@@ -30,14 +29,9 @@ def measured(ring, focusing, defocusing=0.0):
     return small_steps(ring, causes, noise=NOISE, seed=1)
 
 
-def begun(ring, data):
-    data = response_data(ring, data)
-    return begin(data, split_columns(data, 0.2, np.random.default_rng(1)))
-
-
 def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring):
     """All focusing quadrupoles 3 % weak: from the design itself every family was refused."""
-    design = begun(small_ring, measured(small_ring, -0.03))
+    design = begin(*parted(small_ring, measured(small_ring, -0.03), 1))
     (values,) = first_guess.first_guess(design).values.values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
@@ -85,14 +79,15 @@ def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
 
 
 def test_a_near_design_is_where_the_fit_begins(small_ring):
-    assert first_guess.first_guess(begun(small_ring, measured(small_ring, 0.005))) is None
+    near = begin(*parted(small_ring, measured(small_ring, 0.005), 1))
+    assert first_guess.first_guess(near) is None
 
 
 def test_a_design_that_stores_no_beam_with_a_step_keeps_what_it_has(small_ring):
     """`no closed orbit` had been all that was said of SPEAR3 with 2 % on its main quadrupoles."""
     data = measured(small_ring, 0.0)
     large = dataclasses.replace(data, kicks=5e3 * data.kicks, response=5e3 * data.response)
-    state = begun(small_ring, large)
+    state = begin(*parted(small_ring, large, 1))
     with pytest.raises(UnstableRingError):
         state.at.bend()
     assert bend(state).at is state.at

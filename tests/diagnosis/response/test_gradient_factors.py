@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shared import small_steps
+from shared import parted, small_steps
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
@@ -17,9 +17,8 @@ from tmlattice.diagnosis.response.common_factors import (
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
-from tmlattice.lattice.alike import families
+from tmlattice.lattice.slices import families
 from tmlattice.lattice.supplies import magnets, supplied_alike
-from tmlattice.observe.response_data import response_data, split_columns
 
 SINGLE = QuadrupoleGradient()
 
@@ -33,8 +32,7 @@ def explained(ring, shared, extra=(), seed=1):
         for i in range(16)
     ]
     measured = small_steps(ring, [*causes, *extra], seed=seed)
-    data = response_data(ring, measured)
-    state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
+    state = begin(*parted(ring, measured))
     return explain_gradients(settle(allow(state, [CorrectorCalibration(), MonitorGain(), SINGLE])))
 
 

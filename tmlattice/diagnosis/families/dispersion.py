@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from tmlattice.arrays import Array, rms
+from tmlattice.arrays import Array, Reals, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
@@ -75,7 +75,8 @@ class _Kicks(Family):
         read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())
         names = tuple(data.measured.correctors)
         planes = data.plane.tobytes()
-        key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names, planes)
+        kick = float(data.kicks[-1])
+        key = (self.name, data.at.tobytes(), kick, data.energy, read, names, planes)
         return data.ring.remembered(
             key, lambda: patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
         )
@@ -258,14 +259,14 @@ class OrbitFamily(RingFamily):
     def patterns(self, data: ResponseData) -> OrbitPatterns:
         """The patterns in the design."""
         return data.ring.remembered(
-            self.name, lambda: orbit_patterns(data.design, self.plane, self.effects)
+            (self.name, data.energy), lambda: orbit_patterns(data.design, self.plane, self.effects)
         )
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
         return len(self.patterns(data).amounts)
 
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def rows(self, at: Predicted, values: Array) -> Reals:
         """Derivatives by all errors."""
         causes, amounts, _ = self.patterns(at.data)
         return at.rows(causes, self.block, amounts)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, Reals
 from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -35,6 +35,7 @@ class Family(ABC):
         late: whether it is added once the others have converged.
         single: whether one member may be faulty; not a pattern, or a type with one design.
         rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
+        causes: of its numbers, if a fit chooses them.
     """
 
     name: ClassVar[str]
@@ -49,6 +50,7 @@ class Family(ABC):
     rms: ClassVar[float]
     tails: ClassVar[float] = np.inf
     most: ClassVar[float] = np.inf
+    causes: ClassVar[tuple[Hypothesis, ...]] = ()
 
     @property
     def title(self) -> str:
@@ -69,7 +71,7 @@ class Family(ABC):
         return [Group(self.name, np.eye(self.size(data)), self.rms, self.tails, most=self.most)]
 
     @abstractmethod
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def rows(self, at: Predicted, values: Array) -> Reals:
         """Derivatives of the readings of its block, m: [number, column, monitor]; or, for numbers
         of one column or BPM, [column, monitor]."""
 
@@ -117,7 +119,7 @@ class RingFamily(Family):
         """Derivative of each number's causes by the number, over their shares."""
         return np.ones(len(values))
 
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def rows(self, at: Predicted, values: Array) -> Reals:
         """Derivatives of the response, with gains."""
         each = self.moves(at.data)
         column = {cause: i for i, cause in enumerate(dict.fromkeys(c for own in each for c in own))}

@@ -34,7 +34,7 @@ from tmlattice.diagnosis.families.fields import (
 )
 from tmlattice.effects import Cause, Hypothesis, Monitors, expected_spread, find
 from tmlattice.inference.priors import Group
-from tmlattice.lattice.alike import families
+from tmlattice.lattice.slices import families
 from tmlattice.observe.orbit_response import DELTA, Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 

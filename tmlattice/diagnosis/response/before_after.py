@@ -1,18 +1,17 @@
 """The change between two orbit responses of one machine.
 
->>> change = diagnose_change(ring, before, after)
+>>> change = diagnose(ring, after, reference=before)
 >>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
 
 The ring, its BPMs and its correctors are fitted to the first measurement. Its residual cancels in
-the difference of both (`observe.response_change`), which is fitted in turn, with the dispersion and
-the energy of the first fit. Drifts of BPMs and correctors are nuisances with learnt scales. Stated
-errors include the scatter of the magnets of one supply, which is learnt, and the undetermined
-errors of the first fit (`undetermined`). Findings are supplies (magnets whose names begin alike),
-single magnets, gradients in sextupoles and wigglers (by the orbit there), and insertion devices,
-selected by the marginal likelihood, see `inference.levels`.
+the difference of both (`observe.orbit_response.response_change`), which is fitted in turn, with the
+dispersion and the energy of the first fit. Drifts of BPMs and correctors are nuisances with learnt
+scales. Stated errors include the scatter of the magnets of one supply, which is learnt, and the
+undetermined errors of the first fit (`undetermined`). Findings are supplies (magnets whose names
+begin alike), single magnets, gradients in sextupoles and wigglers (by the orbit there), and
+insertion devices, selected by the marginal likelihood, see `inference.common_factors`.
 """
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,6 +36,7 @@ from tmlattice.diagnosis.findings import (
     strongest_first,
     with_consequences,
 )
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.hierarchical import (
@@ -50,7 +50,7 @@ from tmlattice.diagnosis.response.hierarchical import (
 )
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear, with_undetermined
-from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
+from tmlattice.diagnosis.response.procedure import as_diagnosis, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
@@ -65,12 +65,11 @@ from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.common_factors import MAX_CHOSEN
-from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
+from tmlattice.inference.judgement import SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted, alike, response_change
-from tmlattice.observe.response_data import HELD, ResponseData, Split, response_data, split_columns
+from tmlattice.observe.response_data import ResponseData, Split, response_data, split_columns
 
 DRIFT, OUTSTANDING = 0.03, 8.0
 """Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
@@ -80,31 +79,12 @@ EVERYWHERE = 5e-4
 """Relative scatter of magnets above which it is reported without a single detected change."""
 
 
-def diagnose_change(
-    ring: Ring,
-    before: OrbitResponse,
-    after: OrbitResponse,
-    *,
-    holdout: float = HELD,
-    effects: Sequence[str] | None = None,
-    max_effects: int = MAX_CHOSEN,
-    false_alarm: float = DEFAULT.false_alarm,
-    assume: Sequence[str] = (),
-    seed: int = 0,
-    progress: Callable[[str], Any] = lambda stage: None,
-) -> Diagnosis:
+def diagnose_change(before: OrbitResponse, after: OrbitResponse, options: Options) -> Diagnosis:
     """Diagnose the change from one response to the other.
 
     Args:
-        ring: the design.
         before, after: of the same machine; correctors and BPMs of only one of them are excluded.
-        holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
-        effects: only errors and changes of these are sought; None: all.
-        max_effects: most findings.
-        false_alarm: probability of a finding in two measurements of an unchanged machine.
-        assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
-        seed: of the split.
-        progress: called with the name of each stage.
+        options: correctors that are held out validate the gap; amounts are fitted to all of them.
 
     Returns:
         Its ring is the one fitted to the first measurement; its steps are those of the change.
@@ -114,9 +94,10 @@ def diagnose_change(
         UnknownNameError: an effect, a BPM or a corrector that does not exist.
         UnstableRingError: no closed orbit.
     """
-    started = time.perf_counter()
+    ring, effects, progress = options.ring, options.effects, options.progress
+    holdout, judgement, most = options.holdout, options.judgement, options.max_effects
     trials = trials_of(effects, CHANGES)
-    before, after = (corrected_data(ring, one, assume) for one in (before, after))
+    before, after = (corrected_data(ring, one, options.assume) for one in (before, after))
     messages = data_checks(ring, after, reference=before)
     messages += _lost(before, after)
     before, after = alike(ring, before, after)
@@ -128,7 +109,7 @@ def diagnose_change(
         messages.append("the two measurements are the same, to the last digit")
     before, first, swaps_before = without_swaps(partial(response_data, ring), before, holdout)
     progress("the reference")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(options.seed)
     # a changed gradient would move a closed orbit of the reference's ring, which operators correct
     still = [trial for trial in STEPS if not any(isinstance(f, OrbitFamily) for f in trial)]
     steps = () if same else trials_of(effects, still)
@@ -147,18 +128,12 @@ def diagnose_change(
     of_labels = (label.finding(there, other="did") for label in swapped)
     pairs = [own for own in of_labels if own is not None]
     split = split_columns(data, holdout, rng)
-    judgement = Judgement(false_alarm=false_alarm)
-    options = {
-        "reference": True, "holdout": holdout,
-        "effects": None if effects is None else list(effects), "max_effects": max_effects,
-        "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
-    }  # fmt: skip
     open_ = undetermined(fitted)
-    fit = _sparse_or_all(data, split, trials, effects, judgement, seed, progress, open_)
+    fit = _sparse_or_all(data, split, trials, options, open_)
     if isinstance(fit, SparseFit):
         causes = tuple(cause for cause, _ in fit.fitted_causes)
         sought = [own for own in fit.findings if not is_drift(cause_of(own))]
-        found = strongest_first([*sought[:max_effects], *pairs])
+        found = strongest_first([*sought[:most], *pairs])
         return as_diagnosis(
             there, fit.fit, fit.fit.state.at.errors.ring, fit.fitted_causes,
             verdict=least_certain(found, fit.verdict),
@@ -166,7 +141,7 @@ def diagnose_change(
             warnings=(*messages, *fit.messages),
             covariance=fit.covariance,
             noise_estimated=False,
-            provenance=provenance(ring, options, seed, started),
+            provenance=options.provenance(background={}),
         )  # fmt: skip
     progress("changes")
     whole = settle(_all_columns(fit.state))
@@ -174,7 +149,7 @@ def diagnose_change(
     drifted = drifts(whole)
     changed += outstanding(there, [row for row, _ in drifted], judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
-    named = strongest_first(wanted)[:max_effects]
+    named = strongest_first(wanted)[:most]
     causes = tuple(cause_of(own) for own in named)
     known = [own.amount_sigma or 0.0 for own in named]
     reported: list[StatedCause] = list(zip(causes, known, strict=True))
@@ -192,7 +167,7 @@ def diagnose_change(
         warnings=(*messages, *_messages(data, fit, whole, scatter)),
         supports=tuple(supports),
         noise_estimated=True,
-        provenance=provenance(ring, options, seed, started),
+        provenance=options.provenance(background={}),
     )  # fmt: skip
 
 
@@ -355,24 +330,19 @@ def _sparse_or_all(
     data: ResponseData,
     split: Split,
     trials: Sequence[Trial],
-    effects: Sequence[str] | None,
-    judgement: Judgement,
-    seed: int,
-    progress: Callable[[str], Any],
+    options: Options,
     open_: Undetermined,
 ) -> SparseFit | HierarchicalFit:
     """The sparse solution of a change, or the fit of all possible changes."""
-    asked = changes() if effects is None else effects
-    sparse = sparse_fit(
-        data, split, asked, MAX_CHOSEN, judgement, seed, progress, and_orbits(data.ring, open_)
-    )
+    asked = changes() if options.effects is None else options.effects
+    sparse = sparse_fit(data, split, asked, options, and_orbits(data.ring, open_))
     if sparse is not None and all(is_drift(cause) for cause, _ in sparse.fitted_causes):
         sparse = None
     if sparse is not None and sparse.noise:
         return sparse
-    fit = _fit_change(data, split, trials, progress)
-    if sparse is None or outperforms(fit, sparse, judgement):
-        return reversed_decisions(fit, progress)
+    fit = _fit_change(data, split, trials, options.progress)
+    if sparse is None or outperforms(fit, sparse, options.judgement):
+        return reversed_decisions(fit, options.progress)
     return sparse
 
 

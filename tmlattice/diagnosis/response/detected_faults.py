@@ -1,6 +1,6 @@
 """Single faults of an orbit response among distributed errors.
 
->>> apart, findings, messages = detected_faults(data, split, fit.state, hypotheses, most, judgement)
+>>> apart, findings, messages = detected_faults(fit.state, hypotheses, options)
 
 All usual distributed errors of a ring are the background model of a fault (`small_errors`): the
 families of a hierarchical fit, and the closed orbit in sextupoles. All readings are fitted; of
@@ -18,9 +18,10 @@ family's scatter, and above the chance level of so many causes and families.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtr
@@ -43,6 +44,7 @@ from tmlattice.diagnosis.families.steps import (
     MonitorRoll,
 )
 from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, fit_chi2, readable
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
@@ -89,20 +91,29 @@ WORTH, HIDDEN = 15.0, 8.0
 family, and for other causes, which increase the scales of all patterns of an orbit."""
 TRIES = 3
 """Most candidates per step; one in a response of many readings."""
-LACKS = 2.0
-"""Largest chi-square per reading of a plane, given distributed errors, for a search in any case."""
+LACKS, ROUGHLY = 2.0, 4.0
+"""Largest chi-square per reading of a plane, given distributed errors, for a search in any case;
+and after a rough fit, which leaves at most twice as much as the final one."""
 MEMBERS = 16
 """Assumed number of orbit patterns, where there are none."""
 
 
 # --- the background model -------------------------------------------------------------------------
-def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
-    """Return the fit of the distributed errors to all readings outside the validation set.
+def small_errors(
+    fitted: State, complete: bool = False,
+    hopeless: Callable[[State, float], bool] = lambda state, most: False,
+) -> State:  # fmt: skip
+    """Return the fit of the distributed errors to all readings outside the validation set, of up to
+    two starts the more probable one; a rough fit, or the given one, where all are hopeless.
 
     Args:
-        data, split: the data, and the validation split.
         fitted: a hierarchical fit of the data.
+        complete: whether it has all families, so that a fit of further readings hardly changes its
+            residual.
+        hopeless: whether the residual of a fit, above a chi-square per reading, is too large for
+            single faults to be sought.
     """
+    data, split = fitted.data, fitted.split
     orbits, half = data.orbits.copy(), split.half.copy()
     orbits[:-1][split.held[:-1, None] & ~split.half[:-1]] = np.nan  # the validation readings
     for column in np.flatnonzero(split.held):
@@ -120,10 +131,16 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
         design = replace(begin(data, split), good=fitted.good, jitter=fitted.jitter,
                          independent=equal)  # fmt: skip
         starts.append(allow(design, families))
-    found: list[tuple[float, State]] = []
+    given_up, found = list[State](), list[tuple[float, State]]()
+    if complete and hopeless(fitted, LACKS):
+        given_up.append(fitted)
+        starts.remove(continued)
     for start in starts:
         try:
             state = settle(jump(start, beyond=1.0), gain=ROUGH)
+            if hopeless(state, ROUGHLY):
+                given_up.append(state)
+                continue
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
@@ -131,7 +148,9 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
         log.info("distributed errors: evidence %.1f", found[-1][0])
         if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
-    return max(found, key=lambda one: one[0])[1] if found else continued
+    if found:
+        return max(found, key=lambda one: one[0])[1]
+    return (given_up or [continued])[0]
 
 
 def sizes_in(there: Linear) -> tuple[Group, ...]:
@@ -179,7 +198,7 @@ class Others(RingFamily):
     """
 
     block: int  # type: ignore[misc]
-    causes: tuple[Hypothesis, ...] = ()
+    causes: tuple[Hypothesis, ...] = ()  # type: ignore[misc]
 
     trust, effects = 0.03, ()
 
@@ -219,12 +238,8 @@ def with_number(state: State, cause: Hypothesis, block: int) -> State:
     )
     families = [f for f in state.families if f.variable != name]
     values = {**state.values, name: np.append(state.values.get(name, np.zeros(0)), 0.0)}
-    # other causes have other derivatives
-    kept = {variable: own for variable, own in state.kept.items() if variable != name}
-    return replace(
-        state, apart=apart, families=(*families, Others(block, (*have, cause))), values=values,
-        kept=kept,
-    )  # fmt: skip
+    families.append(Others(block, (*have, cause)))
+    return replace(state, apart=apart, families=tuple(families), values=values)
 
 
 def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Candidate]:
@@ -393,32 +408,31 @@ class Seen:
 
 # --- the search -----------------------------------------------------------------------------------
 def detected_faults(
-    data: ResponseData,
-    split: Split,
-    fitted: State,
-    hypotheses: Sequence[Hypothesis],
-    most: int,
-    judgement: Judgement,
-    progress: Callable[[str], Any] = lambda stage: None,
+    fitted: State, hypotheses: Sequence[Hypothesis], options: Options
 ) -> tuple[tuple[Candidate, ...], list[Finding], list[str]]:
     """Return the detected faults, one after another, each given those before it; the findings; and
     a message if the residual is too large for a search.
 
     Args:
-        data, split: the data, and the validation split.
         fitted: a hierarchical fit of the data.
         hypotheses: possible single faults.
-        most: faults at most.
-        judgement: thresholds.
-        progress: called with the name of each stage.
+        options: of the diagnosis.
     """
-    progress("distributed errors")
-    for state in _backgrounds(data, split, fitted, most):
-        search = _Search(state, hypotheses, judgement)
-        message = search.discrepancy_message()
-        if message is not None:
-            return (), [], [message]
-    progress("detected faults")
+    most = options.max_effects
+    options.progress("distributed errors")
+    search_in = cache(lambda state: _Search(state, hypotheses, options.judgement))
+    tried = {family.name for family in (*fitted.families, *fitted.unneeded)}
+    usual = {family.name for own in readable(fitted, STEPS) for family in own}
+    state = small_errors(
+        fitted, most >= len(STEPS) and tried >= usual,
+        lambda state, most: search_in(state).discrepancy_message(most) is not None,
+    )  # fmt: skip
+    search = search_in(state)
+    search_in.cache_clear()  # the others have products of their own
+    message = search.discrepancy_message()
+    if message is not None:
+        return (), [], [message]
+    options.progress("detected faults")
     seen_before: list[set[Hypothesis]] = []
     while len(search.state.apart) < min(most, Search.most):
         further = search.next()
@@ -432,16 +446,6 @@ def detected_faults(
         seen_before.append(chosen)
     apart = search.state.apart
     return apart, [search.finding(search.seen(search.state), one) for one in apart], []
-
-
-def _backgrounds(data: ResponseData, split: Split, fitted: State, most: int) -> Iterator[State]:
-    """The fit, if no family was left untried in it, so that a fit of further readings hardly
-    changes its residual; and that fit."""
-    tried = {family.name for family in (*fitted.families, *fitted.unneeded)}
-    usual = {family.name for own in readable(fitted, STEPS) for family in own}
-    if data.orbits.size > ANEW and most >= len(STEPS) and tried >= usual:
-        yield fitted
-    yield small_errors(data, split, fitted)
 
 
 class _Search:
@@ -464,13 +468,17 @@ class _Search:
             self.latest = Seen(state, self.hypotheses, self.problem)
         return self.latest
 
-    def discrepancy_message(self) -> str | None:
+    def discrepancy_message(self, most: float = LACKS) -> str | None:
         """The message that the residual far exceeds the noise, and no single cause explains most of
-        it: model discrepancy could be detected as a fault. None otherwise."""
+        it: model discrepancy could be detected as a fault. None otherwise.
+
+        Args:
+            most: largest chi-square per reading of a plane for a search in any case.
+        """
         planes = fit_chi2(self.state)[:2]
         worst = max((0, 1), key=lambda plane: planes[plane].ratio)
         own = planes[worst]
-        if own.ratio**2 <= LACKS:
+        if own.ratio**2 <= most:
             return None
         # by the noise alone: a large residual of a column reduces its weight
         left = [self.left_beside(*leader)[worst] for leader in self.leaders()]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Flags
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
@@ -32,6 +32,7 @@ from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
     GAIN,
     REQUIRED,
+    bounded_step,
     evidence_of,
     linear_evidence,
     one_step,
@@ -270,8 +271,8 @@ def decisions(
 def reversed_decisions(
     fit: HierarchicalFit, progress: Callable[[str], Any] = lambda stage: None
 ) -> HierarchicalFit:
-    """Return the fit with the scores that each decision would have if it were reversed, after one
-    step in which the other families are fitted again; none if that step diverges."""
+    """Return the fit with the scores that each decision would have if it were reversed, with the
+    other families fitted again, linearised at the fit; none where that diverges."""
     rejected = [trial for trial, step in fit.decisions.items() if not step.kept]
     state = allow(fit.state, [family for trial in rejected for family in trial])
     there = {block: linear(state, block) for block in (0, 1) if state.of_block(block)}
@@ -280,15 +281,17 @@ def reversed_decisions(
         progress(step.reversed_decision)
         without = [own for own in rejected if own != trial] + [trial] * step.kept
         names = {name for own in without for name in _priors(own, state)}
-        moved: State | None = state
-        for block in _blocks(trial):
-            if moved is not None and block in there:
-                moved = _moved_without(moved, block, there[block], names)
-        if moved is None:
+        moved: dict[int, Array] = {}
+        try:
+            for block in there.keys() & _blocks(trial):
+                own = _narrow(there[block], names)
+                change = bounded_step(own, 1.0).values - own.start
+                moved[block] = own.readings(state.data.plane_of(block), change)
+        except np.linalg.LinAlgError:  # the others are not determined
             continue
         gone = {family.name for own in without for family in own}
-        left = tuple(family for family in moved.families if family.name not in gone)
-        scores = score(replace(moved, families=left), step.effect)
+        left = tuple(family for family in state.families if family.name not in gone)
+        scores = score(replace(state, families=left), step.effect, moved=moved)
         if scores.heldout_rms_in_plane < DIVERGED * fit.steps[0].heldout_rms_in_plane:
             scored[trial] = replace(scores, parameters=step.parameters, kept=step.kept,
                                     log_evidence=step.log_evidence)  # fmt: skip
@@ -371,26 +374,25 @@ def _priors(trial: Trial, state: State) -> set[str]:
     return {group.name for family in trial for group in family.groups(state.data)}
 
 
-def _moved_without(state: State, block: int, there: Linear, names: Collection[str]) -> State | None:
-    """The state after one step of a block in which some priors are narrow, so that their numbers
-    are zero; None if it has no closed orbit, or the others are not determined."""
+def _narrow(there: Linear, names: Collection[str]) -> Linear:
+    """The linearisation in which some priors are so narrow that their numbers are zero."""
     groups = tuple(
         replace(group, basis=0 * group.basis) if group.name in names else group
         for group in there.groups
     )
-    try:
-        moved, _, after = one_step(state, block, there._replace(groups=groups), corrected=0)
-    except np.linalg.LinAlgError:
-        return None
-    return moved if np.isfinite(after) else None
+    return there._replace(groups=groups)
 
 
 def _without(state: State, trials: Sequence[Trial]) -> State:
-    """The state without the families of some trials, after one step of the others with the
-    derivatives here; the others unchanged if no beam is stored there."""
+    """The state without the families of some trials, after one step of the others; these unchanged
+    if no beam is stored there."""
     families = [f for own in trials for f in own if state.allows(f.name)]
+    names = {name for own in trials for name in _priors(own, state)}
     moved = state
     for block in sorted({family.block for family in families}):
-        names = {name for own in trials for name in _priors(own, state)}
-        moved = _moved_without(moved, block, linear(moved, block), names) or moved
+        try:
+            other, _, after = one_step(moved, block, _narrow(linear(moved, block), names))
+        except np.linalg.LinAlgError:  # the others are not determined
+            continue
+        moved = other if np.isfinite(after) else moved
     return forbid(moved, families)

@@ -4,7 +4,7 @@ The two orbits of a step are read seconds or minutes apart. If a noisy supply, a
 ground motion kicks the beam in between, all BPMs read the same additional closed orbit, in each
 step with another amplitude. A drift of the energy does the same with the orbit of the RF step. So
 jitter is a covariance of each column's readings, whose amplitudes are integrated out
-(`inference.common`), and not noise of single BPMs.
+(`inference.normal.common`), and not noise of single BPMs.
 
 Jitter is sought in the plane that is not kicked, where errors of the ring have little effect, given
 the roll of each corrector. Sources are added one by one by their evidence. Their positions are

@@ -11,14 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from tmlattice.arrays import Array, Indices
-from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
 from tmlattice.inference.normal import Normal, Posterior, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
 
-STILL = 0.05
-"""Mean move of the ring, as a share of the step bounds, above which derivatives are renewed."""
+NEAR, STILL = 0.05, 0.3
+"""Mean move of the ring, as a share of the step bounds, above which the derivatives of a block are
+renewed: for evidence and errors, and for a step. Those at different rings would separate
+near-degenerate families that the readings do not separate."""
 
 
 def _ring(state: State) -> dict[str, Array]:
@@ -27,26 +28,38 @@ def _ring(state: State) -> dict[str, Array]:
             for f in state.families if f.per == "ring"}  # fmt: skip
 
 
-def _rows(state: State, family: Family) -> Kept:
-    """The derivatives by a variable of the ring, renewed if the ring has moved."""
-    ring, gain = _ring(state), state.at.gain(family.block)
+def _derivatives(state: State, block: int, within: float) -> Mapping[str, Kept]:
+    """The derivatives by the ring's variables of a block, all at nearly one ring."""
+    ring, gain = _ring(state), state.at.gain(block)
     scale = 1 + state.at.errors.calibration
-    kept = state.kept.pop(family.variable, None)
-    if kept is not None and len(kept.rows) == len(ring[family.variable]):
-        moved = np.concatenate([_change(kept.at, ring, name) for name in {**kept.at, **ring}])
-        if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
-            return kept
-    kept = None  # freed before the next are computed
-    return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
+    own = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
+    at, before = state.kept.pop(block, (ring, {}))
+    kept = {
+        name: before[name] for name, family in own.items()
+        if name in before and before[name].causes == family.causes
+        and len(before[name].rows) == len(ring[name])
+        and not scale[before[name].scale == 0].any()
+    }  # fmt: skip
+    del before  # freed before others are computed
+    if _distance(at, ring) >= (within if len(kept) == len(own) else NEAR):
+        at, kept = ring, {}
+    for name, family in own.items():
+        if name not in kept:
+            rows = np.asarray(family.rows(state.at, state.values[name]), dtype=np.float32)
+            kept[name] = Kept(rows, family.causes, gain, scale)
+    state.kept[block] = at, kept
+    return kept
 
 
-def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
-    """Change of a variable; the shorter one of both values is padded with zeros."""
-    old, new = (one.get(name, np.zeros(0)) for one in (before, now))
-    change = np.zeros(max(len(old), len(new)))
-    change[: len(new)] += new
-    change[: len(old)] -= old
-    return change
+def _distance(before: Mapping[str, Array], now: Mapping[str, Array]) -> float:
+    """The rms change of the ring's numbers; those that one of both lacks are zero there."""
+    count, square = 0, 0.0
+    for name in {**before, **now}:
+        old, new = (one.get(name, np.zeros(0)) for one in (before, now))
+        count += (size := max(len(old), len(new)))
+        change = np.pad(new, (0, size - len(new))) - np.pad(old, (0, size - len(old)))
+        square += float(change @ change)
+    return float(np.sqrt(square / max(count, 1)))
 
 
 def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
@@ -87,8 +100,7 @@ class Linear(NamedTuple):
         out = values[:m].reshape(-1, 2)[:, plane].T * self.by_monitor
         out += values[m:end, None] * self.by_column
         for own in self.ring:
-            moved = np.tensordot(values[end : end + len(own.rows)], own.rows, 1)
-            out += moved if own.now is None else own.now * moved
+            out += own.readings(values[end : end + len(own.rows)])
             end += len(own.rows)
         return out
 
@@ -104,15 +116,27 @@ class Linear(NamedTuple):
         return out
 
 
-def linear(state: State, block: int) -> Linear:
-    """Normal equations of a state with its parameters, priors and step bounds."""
-    return state.once(("linear", block), lambda: _linear(state, block))
+def linear(state: State, block: int, within: float = NEAR) -> Linear:
+    """Normal equations of a state with its parameters, priors and step bounds.
+
+    Args:
+        state, block: where.
+        within: mean move of the ring, as a share of the step bounds, up to which derivatives at
+            another ring are used.
+    """
+    key = ("linear", block)
+    latest = state.latest
+    if key in latest and latest[key][0]() is state and latest[key][1][0] > within:
+        del latest[key]  # freed before another is computed
+    found: Linear = state.once(key, lambda: (within, _linear(state, block, within)))[1]
+    return found
 
 
-def _linear(state: State, block: int) -> Linear:
+def _linear(state: State, block: int, within: float) -> Linear:
     data, at = state.data, state.at
     columns, monitors = data.shape
     families = state.of_block(block)
+    kept = _derivatives(state, block, within)
     where: dict[str, slice] = {}
     rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
     ring: list[Slopes] = []
@@ -121,7 +145,7 @@ def _linear(state: State, block: int) -> Linear:
     for family in {f.variable: f for f in families}.values():
         values = state.values[family.variable]
         if family.per == "ring":
-            current = state.kept[family.variable] = _rows(state, family)
+            current = kept[family.variable]
             share = _now(current, at.gain(block), 1 + at.errors.calibration)
             where[family.variable] = slice(end, end + len(values))
             end += len(values)
@@ -129,7 +153,7 @@ def _linear(state: State, block: int) -> Linear:
             trust.append(np.full(len(values), family.trust))
             ring.append(Slopes(current.rows, share))
         else:
-            slopes = family.rows(at, values)
+            slopes = np.asarray(family.rows(at, values), dtype=float)
             low = 0 if family.per == "monitor" else 2 * monitors
             mine = where[family.variable] = slice(low, low + len(values))
             start[0][mine], trust[0][mine] = values, family.trust

@@ -8,12 +8,12 @@ numbers of the fit, linearised, and the marginal likelihood of the fitted readin
 families of errors. Held-out readings are predicted with each; numbers of their own columns, which
 no fitted reading determines, are zero.
 
-To add a hypothesis, write a function that returns its patterns at the fit, and add it to
-`HYPOTHESES`. What is a family of the fit, or beam jitter, is none: every fit tests it.
+To add a hypothesis, add a row to `HYPOTHESES`, with a function that returns its patterns at the
+fit. What is a family of the fit, or beam jitter, is none: every fit tests it.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,16 +50,17 @@ class MissingEffect:
         effect: its name.
         unit: of the amounts.
         expected: physically plausible amounts.
-        patterns: d reading / d amount in each column's own plane, m, [number, column, monitor].
         most: largest plausible amount: the prior rms of a few numbers, and the largest one of many,
             whose scale is learnt.
+        patterns: returns d reading / d amount in each column's own plane at the fit, m,
+            [number, column, monitor]; no number where the ring does not have the effect.
     """
 
     effect: str
     unit: str
     expected: str
-    patterns: Array = field(repr=False)
     most: float
+    patterns: Callable[[State], Array]
 
 
 def _readings(state: State, beam: Array) -> Array:
@@ -87,34 +88,24 @@ def _orders(state: State) -> tuple[Array, Array]:
     return (up + down) / 2 - model.readings[state.data.at], (up - down) / 2 - linear
 
 
-def _one_sided(state: State) -> MissingEffect:
-    second, _ = _orders(state)
-    return MissingEffect(
-        "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided",
-        _readings(state, second)[None], most=1.1,
-    )  # fmt: skip
+def _one_sided(state: State) -> Array:
+    return _readings(state, _orders(state)[0])[None]
 
 
-def _third_order(state: State) -> MissingEffect:
+def _third_order(state: State) -> Array:
     third = _orders(state)[1]
     third[-1] = 0
-    return MissingEffect(
-        "third order of two-sided steps", "beyond the model's", "0; -1: none",
-        _readings(state, third)[None] / 4, most=2.0,
-    )  # fmt: skip
+    return _readings(state, third)[None] / 4
 
 
-def _corrector_energy(state: State) -> MissingEffect:
+def _corrector_energy(state: State) -> Array:
     model, names = state.at.model, state.data.measured.correctors
     own = model.rf_response() / model.rf_start[5]
     flat = model.response(names) - model.columns(names).start[:, 5, None, None] * own
     shift = state.at.orbits(model)
     shift[:-1] -= flat[:, state.data.at] * state.data.kicks[:-1, None, None]
     shift[-1] = 0
-    return MissingEffect(
-        "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
-        _readings(state, shift)[None], most=1.1,
-    )  # fmt: skip
+    return _readings(state, shift)[None]
 
 
 def _each(patterns: Array) -> Array:
@@ -125,12 +116,10 @@ def _each(patterns: Array) -> Array:
     return rows.reshape(-1, columns, monitors)
 
 
-def _position(state: State) -> MissingEffect:
+def _position(state: State) -> Array:
     """The position of the field of each corrector."""
     rows = _readings(state, state.at.jumps) * state.data.kicks[:, None]
-    return MissingEffect(
-        "corrector's field displaced in s, each", "m", "< 0.05 m", _each(rows[None]), most=0.05
-    )
+    return _each(rows[None])
 
 
 def _in_time(state: State, patterns: Array, constant: bool = True) -> Array:
@@ -147,17 +136,14 @@ def _in_time(state: State, patterns: Array, constant: bool = True) -> Array:
     return np.asarray(rows.reshape(-1, *rows.shape[2:]))
 
 
-def _energy_in_time(state: State) -> MissingEffect:
+def _energy_in_time(state: State) -> Array:
     """A drift of the energy during the steps."""
     rf = _readings(state, state.at.beam)[-1]
     pattern = np.where((state.data.plane == 0)[:, None], rf, 0.0)
-    return MissingEffect(
-        "drift of the energy in order of time", "RF step", "< 1e-3",
-        _in_time(state, pattern[None]), most=1e-3,
-    )  # fmt: skip
+    return _in_time(state, pattern[None])
 
 
-def _orbit_in_time(state: State) -> MissingEffect:
+def _orbit_in_time(state: State) -> Array:
     """Closed orbits between the readings of a step, as by random kicks."""
     orbits = _readings(state, state.at.orbits(state.at.model))
     waves = np.zeros((2, WAVES, *orbits.shape))
@@ -167,10 +153,7 @@ def _orbit_in_time(state: State) -> MissingEffect:
         per_kick = np.nan_to_num(orbits[mine]) / state.data.kicks[mine, None]
         found = np.linalg.svd(per_kick, full_matrices=False)[2][:WAVES]
         waves[p, : len(found), mine] = found * np.sqrt(found.shape[1])
-    return MissingEffect(
-        "drift of the orbit in order of time", "m", "< 1e-5",
-        _in_time(state, waves.reshape(-1, *orbits.shape)), most=1e-5,
-    )  # fmt: skip
+    return _in_time(state, waves.reshape(-1, *orbits.shape))
 
 
 def _gradients(state: State) -> Array:
@@ -183,60 +166,39 @@ def _gradients(state: State) -> Array:
     return total
 
 
-def _gradient_drift(state: State) -> MissingEffect:
-    return MissingEffect(
-        "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4",
-        _each(_gradients(state)), most=1e-4,
-    )  # fmt: skip
-
-
-def _gradients_in_time(state: State) -> MissingEffect:
-    return MissingEffect(
-        "drift of the gradients in order of time", "relative", "< 1e-4",
-        _in_time(state, _gradients(state), constant=False), most=1e-4,
-    )  # fmt: skip
-
-
-def _chromatic_in_time(state: State) -> MissingEffect:
+def _chromatic_in_time(state: State) -> Array:
     """A drift of the beam's energy over all columns, which changes the tunes and the optics."""
     scale = (1 + state.at.errors.calibration)[:, None, None] * DELTA
     slope = _readings(state, state.at.chromatic * scale)[None]
-    return MissingEffect(
-        "drift of the beam's energy in order of time", "1e-3", "< 5",
-        _in_time(state, slope, constant=False), most=5.0,
-    )  # fmt: skip
+    return _in_time(state, slope, constant=False)
 
 
-def _hysteresis(state: State) -> MissingEffect:
+def _hysteresis(state: State) -> Array:
     """Hysteresis: a corrector's iron keeps a share of its step in later columns, of the last step
     alone or of all earlier ones."""
     last = np.zeros_like(state.at.read)
     last[1:-1] = state.at.read[:-2]
     rows = np.stack([state.data.pick(stays) for stays in (last, np.cumsum(last, axis=0))])
     rows[:, -1] = 0  # the RF's
-    return MissingEffect("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
+    return rows
 
 
-def _nonlinear(state: State) -> MissingEffect:
+def _nonlinear(state: State) -> Array:
     """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
-    rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
-    return MissingEffect("nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
+    return np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
 
 
-def _radiation(state: State) -> MissingEffect | None:
+def _radiation(state: State) -> Array:
     pairs = [
         (f"radiation_loss_{kind}s", None)
         for kind in ("bend", "wiggler")
         if any(e.kind == kind for e in state.data.ring.elements)
     ]
-    rows = [_readings(state, slope) for slope in state.at.slopes(pairs)]
-    return MissingEffect(
-        "radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3
-    )
+    return np.array([_readings(state, slope) for slope in state.at.slopes(pairs)])
 
 
-def _monitor_position(state: State) -> MissingEffect:
+def _monitor_position(state: State) -> Array:
     model = state.at.model
     columns = model.columns(state.data.measured.correctors)
     start = np.vstack([columns.start, model.rf_start])
@@ -250,10 +212,10 @@ def _monitor_position(state: State) -> MissingEffect:
     rows = np.zeros((len(state.data.at), *flat.shape))
     for i in range(len(rows)):
         rows[i, :, i] = flat[:, i]
-    return MissingEffect("BPMs displaced in s", "m", "< 0.01 m", rows, most=0.01)
+    return rows
 
 
-def _bend_gradient(state: State) -> MissingEffect:
+def _bend_gradient(state: State) -> Array:
     """Gradients of bends; magnets of one length are one type."""
     ring = state.at.model.ring
     bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
@@ -269,38 +231,67 @@ def _bend_gradient(state: State) -> MissingEffect:
         slope = (state.at.orbits(model) - state.at.orbits(state.at.model)) / BEND_GRADIENT
         scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(state, slope * scale))
-    return MissingEffect("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
+    return np.array(rows)
 
 
-def _second_order_coupling(state: State) -> MissingEffect | None:
+def _second_order_coupling(state: State) -> Array:
     if not state.values.get("skew", np.zeros(1)).any():
-        return None
+        return np.zeros((0, *state.data.shape))
     causes = [c for c in state.at.errors.ring if c.effect != "skew_gradient"]
     flat = state.at.model.changed_to(apply(state.data.ring, causes))
     change = state.at.orbits(state.at.model) - state.at.orbits(flat)
-    return MissingEffect(
-        "coupling to second order", "beyond the model's", "0; -1: none",
-        _readings(state, change)[None], most=1.1,
-    )  # fmt: skip
+    return _readings(state, change)[None]
 
 
-HYPOTHESES: dict[str, Callable[[State], MissingEffect | None]] = {
-    "one_sided_steps": _one_sided,
-    "third_order": _third_order,
-    "gradient_drift": _gradient_drift,
-    "energy_in_time": _energy_in_time,
-    "orbit_in_time": _orbit_in_time,
-    "gradients_in_time": _gradients_in_time,
-    "chromatic_in_time": _chromatic_in_time,
-    "hysteresis": _hysteresis,
-    "corrector_energy": _corrector_energy,
-    "corrector_position": _position,
-    "monitor_nonlinearity": _nonlinear,
-    "monitor_position": _monitor_position,
-    "bend_gradient": _bend_gradient,
-    "radiation": _radiation,
-    "second_order_coupling": _second_order_coupling,
-}
+HYPOTHESES: dict[str, MissingEffect] = {
+    "one_sided_steps": MissingEffect(
+        "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided", 1.1, _one_sided
+    ),
+    "third_order": MissingEffect(
+        "third order of two-sided steps", "beyond the model's", "0; -1: none", 2.0, _third_order
+    ),
+    "gradient_drift": MissingEffect(
+        "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", 1e-4,
+        lambda state: _each(_gradients(state)),
+    ),
+    "energy_in_time": MissingEffect(
+        "drift of the energy in order of time", "RF step", "< 1e-3", 1e-3, _energy_in_time
+    ),
+    "orbit_in_time": MissingEffect(
+        "drift of the orbit in order of time", "m", "< 1e-5", 1e-5, _orbit_in_time
+    ),
+    "gradients_in_time": MissingEffect(
+        "drift of the gradients in order of time", "relative", "< 1e-4", 1e-4,
+        lambda state: _in_time(state, _gradients(state), constant=False),
+    ),
+    "chromatic_in_time": MissingEffect(
+        "drift of the beam's energy in order of time", "1e-3", "< 5", 5.0, _chromatic_in_time
+    ),
+    "hysteresis": MissingEffect(
+        "hysteresis: a share of earlier steps", "share", "< 0.01", 0.01, _hysteresis
+    ),
+    "corrector_energy": MissingEffect(
+        "corrector's energy shift", "beyond the model's", "0; -1: the energy stays", 1.1,
+        _corrector_energy,
+    ),
+    "corrector_position": MissingEffect(
+        "corrector's field displaced in s, each", "m", "< 0.05 m", 0.05, _position
+    ),
+    "monitor_nonlinearity": MissingEffect(
+        "nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", 1e-3, _nonlinear
+    ),
+    "monitor_position": MissingEffect(
+        "BPMs displaced in s", "m", "< 0.01 m", 0.01, _monitor_position
+    ),
+    "bend_gradient": MissingEffect(
+        "gradient of bends, by type", "1/m2", "< 1e-3", 1e-3, _bend_gradient
+    ),
+    "radiation": MissingEffect("radiation in bends, wigglers", "expected loss", "1", 3, _radiation),
+    "second_order_coupling": MissingEffect(
+        "coupling to second order", "beyond the model's", "0; -1: none", 1.1,
+        _second_order_coupling,
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -352,15 +343,14 @@ def weigh(
     used = weight(state, 0)
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
-        own = HYPOTHESES[name](state)
-        if own is None:
-            continue
-        sensitive = [bool(np.any(row * used)) for row in own.patterns]
+        own = HYPOTHESES[name]
+        patterns = own.patterns(state)
+        sensitive = [bool(np.any(row * used)) for row in patterns]
         if not any(sensitive):  # no such places, or no sensitive fitted readings
             continue
-        rows, many = own.most * own.patterns[sensitive], sum(sensitive) > ENOUGH
+        rows, many = own.most * patterns[sensitive], sum(sensitive) > ENOUGH
         there = with_numbers(there, state, 0, PRIOR + name, rows, learnt=many)
-        found[name] = replace(own, patterns=own.patterns[:0])  # large
+        found[name] = own
 
     def with_these(*names: str) -> tuple[float, Posterior]:
         return relearnt(there, {PRIOR + name for name in found.keys() - names})

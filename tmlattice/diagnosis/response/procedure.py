@@ -5,7 +5,7 @@ the BPMs, one of each two neighbours, and the prediction is scored on the other 
 is fitted at half of the BPMs and scored at the other half. Families are selected by the marginal
 likelihood of the fitted readings.
 
->>> result = diagnose_response(ring, measured)
+>>> result = diagnose(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
 
 BPM gains and corrector calibrations are degenerate in scale without the dispersion, and
@@ -13,8 +13,7 @@ neighbouring quadrupoles are correlated. Priors resolve both: correctors of one 
 of one kind or supply, share an error and scatter about it, and the scatter is learnt.
 """
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,6 +35,7 @@ from tmlattice.diagnosis.findings import (
     swap_of,
     with_consequences,
 )
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.common_factors import explain_gradients
 from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
@@ -67,12 +67,12 @@ from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.judgement import DEFAULT, ENOUGH, SIGNIFICANT, Judgement
+from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import overstated
-from tmlattice.observe.response_data import HELD, response_data, split_columns
+from tmlattice.observe.response_data import ResponseData, Split, response_data, split_columns
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.optics import ring_tunes
 
@@ -80,121 +80,95 @@ PATTERNS = 8
 """Number of the strongest patterns of the residual."""
 
 
-def diagnose_response(
-    ring: Ring,
-    measured: OrbitResponse,
-    *,
-    holdout: float = HELD,
-    effects: Sequence[str] | None = None,
-    max_effects: int = len(STEPS),
-    false_alarm: float = DEFAULT.false_alarm,
-    missing: bool = False,
-    assume: Sequence[str] = (),
-    seed: int = 0,
-    progress: Callable[[str], Any] = lambda stage: None,
-) -> Diagnosis:
+def diagnose_response(measured: OrbitResponse, options: Options) -> Diagnosis:
     """Diagnose an orbit response: all families of errors, sparse solutions and single faults.
 
     Args:
-        ring: the design.
         measured: with an RF step, if possible, and with its noise, else that is estimated.
-        holdout: share of the correctors that is never fitted.
-        effects: names of effects whose families are tried; None: all.
-        max_effects: most accepted families.
-        false_alarm: probability of a finding in readings of a faultless ring.
-        missing: score effects that may be missing from the result, too.
-        assume: what is recorded wrongly everywhere, see `measurement.assume`.
-        seed: of the split.
-        progress: called with the name of each stage.
+        options: `effects` are those whose families are tried.
 
     Raises:
         MeasurementError: too few correctors, or effects that have no family.
         UnknownNameError: an effect or a BPM that does not exist.
         UnstableRingError: no closed orbit.
     """
-    begun = time.perf_counter()
+    ring, effects, progress = options.ring, options.effects, options.progress
+    holdout, judgement = options.holdout, options.judgement
     estimated = measured.noise is None
-    measured = corrected_data(ring, measured, assume)
+    measured = corrected_data(ring, measured, options.assume)
     trials, data = trials_of(effects), response_data(ring, measured)
     notes = [*data_checks(ring, measured), *assumed_of(measured, data)]
     measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
         notes, data = notes + gross, response_data(ring, measured)
-    split = split_columns(data, holdout, np.random.default_rng(seed))
-    judgement = Judgement(false_alarm=false_alarm)
-    sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
+    split = split_columns(data, holdout, np.random.default_rng(options.seed))
+    sparse = sparse_fit(data, split, effects, options)
     if sparse is None or not sparse.noise or overstated(ring, data.measured):
-        whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
+        whole = _families(data, split, trials, options)
         worse = sparse is None or outperforms(whole[0], sparse, judgement)
         sparse = None if worse else sparse
-    rejected: tuple[tuple[str, str | None], ...] = ()
+    more: dict[str, Any]
     if sparse is None:
-        fit, measured, labels = whole
+        fit, labels = whole
         fit = reversed_decisions(fit, progress)
-        rejected = tuple((own.elements[0], own.plane) for own in labels if "rejected" in own.kind)
-        fit, findings = _faults(fit, labels, effects, max_effects, judgement, progress)
+        fit, findings = _faults(fit, labels, options)
         notes += [*label_messages(own for own in labels if own not in fit.labels), *fit.messages]
+        notes += reversed_ones(fit.state)
+        # before the covariance of all causes, which is large
+        factors = explain_gradients(fit.state)
+        apart = inconsistencies(fit.state, judgement.false_alarm)
         found, supports, degenerate, correlated, covariance = fitted_causes(fit.state)
-        verdict = least_certain(findings, _verdict(fit, false_alarm))
+        verdict = least_certain(findings, _verdict(fit, judgement.false_alarm))
+        more = {
+            "covariance": covariance,
+            "supports": supports,
+            "degenerate": degenerate,
+            "correlations": correlated,
+            "rejected_channels": tuple(
+                (own.elements[0], own.plane) for own in labels if "rejected" in own.kind
+            ),
+            "common_factors": factors,
+            "inconsistencies": apart,
+        }
     else:
-        fit, found, supports, degenerate, correlated = sparse.fit, sparse.fitted_causes, (), (), ()
-        covariance = sparse.covariance
-        verdict, findings = sparse.verdict, sparse.findings
-    rows = tuple(weigh(fit.state, progress=progress)) if missing else None
-    options = {
-        "holdout": holdout, "effects": None if effects is None else list(effects),
-        "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
-        **({"assume": list(assume)} if assume else {}),
-    }  # fmt: skip
+        fit, found, more = sparse.fit, sparse.fitted_causes, {"covariance": sparse.covariance}
+        verdict, findings = sparse.verdict, sparse.findings[: options.max_effects]
+        notes += sparse.messages
+    missing = options.missing
     causes = tuple(cause_of(own) for own in findings if own.effect)
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
         noise_estimated=estimated,
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
-        warnings=(
-            *notes, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
-            *_warnings(fit),
-        ),
-        degenerate=degenerate,
-        rejected_channels=rejected,
-        correlations=correlated,
-        covariance=covariance,
-        supports=supports,
-        hypotheses=rows,
-        common_factors=None if sparse is not None else explain_gradients(fit.state),
-        inconsistencies=None if sparse is not None else inconsistencies(fit.state, false_alarm),
-        provenance=provenance(ring, options, seed, begun),
+        warnings=(*notes, *_warnings(fit)),
+        hypotheses=tuple(weigh(fit.state, progress=progress)) if missing else None,
+        provenance=options.provenance(background={}, missing=missing),
+        **more,
     )  # fmt: skip
 
 
 def _families(
-    ring: Ring,
-    measured: OrbitResponse,
-    trials: Sequence[Trial],
-    holdout: float,
-    most: int,
-    seed: int,
-    progress: Callable[[str], Any],
-) -> tuple[HierarchicalFit, OrbitResponse, list[Label]]:
-    """The hierarchical fit of the corrected measurement, that measurement, and all labels.
+    data: ResponseData, split: Split, trials: Sequence[Trial], options: Options
+) -> tuple[HierarchicalFit, list[Label]]:
+    """The hierarchical fit of the corrected measurement, and all labels.
 
     Swaps are corrected, and rejected channels are removed, by the design, then by the fit, until
     there are no new ones."""
     known: list[Label] = []
     while True:
-        data = response_data(ring, measured)
-        split = split_columns(data, holdout, np.random.default_rng(seed))
         found = _wrong(begin(data, split), known, of_design=True)
         if not found:
-            fit = fit_families(data, split, trials, most, progress)
+            fit = fit_families(data, split, trials, options.max_effects, options.progress)
             swapped = [own for own in fit.labels if own.kind == "swapped correctors"]
             found = [*new(swapped, known), *_wrong(fit.state, known)]
             if not found:
-                return fit, measured, [*known, *fit.labels]
+                return fit, [*known, *fit.labels]
         known += found
-        measured = corrected(measured, found)
+        measured = corrected(replace(data.measured, noise=data.noise), found)
+        data = response_data(options.ring, measured)
+        split = split_columns(data, options.holdout, np.random.default_rng(options.seed))
 
 
 def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> list[Label]:
@@ -210,24 +184,17 @@ def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> lis
 
 
 def _faults(
-    fit: HierarchicalFit,
-    labels: Sequence[Label],
-    effects: Sequence[str] | None,
-    most: int,
-    judgement: Judgement,
-    progress: Callable[[str], Any],
+    fit: HierarchicalFit, labels: Sequence[Label], options: Options
 ) -> tuple[HierarchicalFit, tuple[Finding, ...]]:
     """The fit given detected single faults, and the findings."""
-    state = fit.state
-    ring = state.data.ring
+    state, effects, judgement = fit.state, options.effects, options.judgement
+    ring, most = state.data.ring, options.max_effects
     planes = () if effects is not None and "monitor_swap" not in effects else labels
     found = [swap_of(state, own.elements[0], judgement) for own in planes
              if own.kind == "swapped planes"]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
     if hypotheses:
-        apart, alone, messages = detected_faults(
-            state.data, state.split, state, hypotheses, most, judgement, progress
-        )
+        apart, alone, messages = detected_faults(state, hypotheses, options)
         fit = given_faults(fit, apart) if apart else fit
         fit = replace(fit, messages=(*fit.messages, *messages))
         found += alone
@@ -259,6 +226,7 @@ def as_diagnosis(
     errors = tuple(sigma for _, sigma in found)
     named = [(finding.effect or "", finding.element) for finding in fields["findings"]]
     return Diagnosis(
+        kind="orbit_response",
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit),
@@ -281,7 +249,12 @@ def as_diagnosis(
         causes=causes,
         errors=errors,
         suspects=outliers(ring, causes, errors, named),
-        view=_view(fit),
+        view=ResponseView(
+            data.measured, data.orbits, fit.design.at.read, fit.state.at.read,
+            fit.state.split.held, good,
+        ),
+        measured=("dispersion",) if np.isfinite(data.orbits[-1]).any() else (),
+        correctors_held_out=int(fit.state.split.held.sum()),
         steps=fit.steps,
         families=fit.families,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
@@ -292,27 +265,7 @@ def as_diagnosis(
         },
         dispersion=dispersion_beside(fit.state.values, data),
         **fields,
-    )
-
-
-def _view(fit: HierarchicalFit) -> ResponseView:
-    state, data = fit.state, fit.state.data
-    design, model = fit.design.at.read, state.at.read
-    return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
-
-
-def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
-    """The provenance of a diagnosis."""
-    from tmlattice.version import __version__
-
-    return {
-        "package": __version__,
-        "lattice": ring.name,
-        "measurement": None,
-        "options": {"reference": False, "background": {}, "radiation": False, **used},
-        "seed": seed,
-        "seconds": time.perf_counter() - begun,
-    }
+    )  # fmt: skip
 
 
 def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags
-from tmlattice.diagnosis.response.linear import Linear, gathered, linear
+from tmlattice.diagnosis.response.linear import STILL, Linear, gathered, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import log_scale, look, weighed, weight
 from tmlattice.errors import UnstableRingError
@@ -44,7 +44,7 @@ cost, which its tangent leaves."""
 
 
 def one_step(
-    state: State, block: int, there: Linear, width: float = 1.0, corrected: int = CORRECTED
+    state: State, block: int, there: Linear, width: float = 1.0
 ) -> tuple[State, float, float]:
     """Solve the readings of one block, and move. Return the state, and the cost before and after.
 
@@ -53,7 +53,6 @@ def one_step(
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block at the start.
         width: factor on the step bounds; small after diverged steps.
-        corrected: largest number of corrections.
     """
     found = bounded_step(there, width)
     groups = {group.name: group for group in found.groups}
@@ -67,7 +66,7 @@ def one_step(
         return _misfit(state, at, block) + penalty
 
     best, last, aim = learnt, np.inf, found.values
-    for turn in range(corrected + 1):
+    for turn in range(CORRECTED + 1):
         values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
         then = learnt.moved({**state.values, **values})
         try:
@@ -77,7 +76,7 @@ def one_step(
         gained = after <= (1 - CORRECTS) * last
         if after <= last:
             best, last = then, after
-        if not gained or turn == corrected:
+        if not gained or turn == CORRECTED:
             break
         # the score there, with the derivatives of the start
         moved = np.zeros_like(there.start)
@@ -102,14 +101,14 @@ def _misfit(state: State, at: State, block: int) -> float:
 
 def bounded_step(there: Linear, width: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
-    groups, trust = there.groups, width * there.trust
+    groups, trust, rounds = there.groups, width * there.trust, EACH
     for _ in range(CROSSED):
-        found = solve(there.normal, groups, there.start, trust, rounds=EACH)
+        found = solve(there.normal, groups, there.start, trust, rounds)
         low = found.values < there.lowest
         if not low.any():
             break
-        rest = ~low[:, None]
-        groups = tuple(replace(group, basis=group.basis * rest) for group in groups)
+        rest, rounds = ~low[:, None], 1  # the scales are learnt
+        groups = tuple(replace(group, basis=group.basis * rest) for group in found.groups)
     return found
 
 
@@ -148,7 +147,7 @@ def settle(
     because the next steps may compensate. Where they do not, the fit returns to the lowest cost,
     and goes on from there with smaller bounds. Weights and bad BPMs are updated at a new lowest
     cost only, so that costs in between are comparable. The fit ends when a step of each block
-    changed the cost by less than progress, or after `REPEATED` further returns.
+    changes the cost by less than progress, either way, or after `REPEATED` further returns.
 
     Args:
         state: the start.
@@ -169,34 +168,36 @@ def settle(
     blocks = [block for block in (0, 1) if state.of_block(block)]
     width = dict.fromkeys(blocks, 1.0)
     gained, away = 0.0, 0  # since the lowest cost
-    idle = failed = 0  # steps and repetitions without progress
+    still = failed = 0  # steps that change little, and repetitions without progress
     for turn, block in enumerate(blocks * most):
-        moved, before, after = one_step(state, block, linear(state, block), width[block])
-        away, idle, settled = away + 1, idle + 1, False
-        if after > before:
+        moved, before, after = one_step(state, block, linear(state, block, STILL), width[block])
+        away, change, cost = away + 1, before - after, max(before, TINY)
+        if change < 0:
             width[block] /= NARROWER
         else:
             then, now = (
                 sum(_misfit(state, at, own) for own in blocks if own != block)
                 for at in (state, moved)
             )
-            gained, cost = gained + before + then - after - now, max(after + now, TINY)
-            state = moved
+            change, cost = change + then - now, max(after + now, TINY)
+            state, gained = moved, gained + change
             log.info("step %d, block %d: cost %.3g less, model discrepancy %s m", turn, block,
                      gained / cost, np.median(best.lacking, axis=1))  # fmt: skip
-            settled = abs(gained) <= gain * cost and idle >= len(blocks)
             if gained > gain * cost:
-                idle = failed = 0
+                failed = 0
             if gained >= 0:
                 best = state = looked(state)
                 gained, away = 0.0, 0
                 width[block] = min(WIDER * width[block], WIDEST)
-        if away == TOGETHER * len(blocks):
-            state, gained, away = best, 0.0, 0
-            idle, failed = 0, failed + 1
-            width = {own: bound / NARROWER for own, bound in width.items()}
-        if settled or failed > REPEATED:
+        still = still + 1 if abs(change) <= gain * cost else 0
+        if still == len(blocks):
             break
+        if away == TOGETHER * len(blocks):
+            state, gained, away, still = best, 0.0, 0, 0
+            width = {own: bound / NARROWER for own, bound in width.items()}
+            failed += 1
+            if failed > REPEATED:
+                break
     return looked(best) if best.values is start.values else best
 
 

@@ -4,9 +4,8 @@ A single faulty magnet, corrector or BPM is identified before families of distri
 fitted. If a sparse set of causes leaves more than noise, the hierarchical fit follows.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from tmlattice.arrays import AT_ONCE, Array, Flags
 from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.options import Options
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
@@ -84,10 +84,7 @@ def sparse_fit(
     data: ResponseData,
     split: Split,
     effects: Sequence[str] | None,
-    most: int,
-    judgement: Judgement,
-    seed: int = 0,
-    progress: Callable[[str], Any] = lambda stage: None,
+    options: Options,
     open_: Undetermined | None = None,
 ) -> SparseFit | None:
     """Return the sparse solution of a response, or None where it has none.
@@ -96,16 +93,14 @@ def sparse_fit(
         data: the measurement on the ring.
         split: half of the BPMs of held-out correctors is fitted, and determines their calibration.
         effects: names of candidates; None: all usual ones.
-        most: most findings.
-        judgement: thresholds.
-        seed: of the threshold's simulation.
-        progress: called with the name of each stage.
+        options: of the diagnosis.
         open_: undetermined errors of the ring, whose response is known.
     """
     hypotheses = single_causes(data, effects)
     if not hypotheses:
         return None
-    progress("single causes")
+    judgement = options.judgement
+    options.progress("single causes")
     design = begin(data, split)
     places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
     problem = Response(
@@ -120,8 +115,9 @@ def sparse_fit(
     gap = max(before.chi2 - count, 1.0)
     enough = max(_noise_alone(problem), min(MISSING * count, count + REST * gap))
     search = Search(
-        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
-    )
+        problem, hypotheses, 1, unnamed=False, enough=enough, seed=options.seed,
+        progress=options.progress,
+    )  # fmt: skip
     try:
         found = _explained(search, problem, before, gap)
     except UnstableRingError:  # the sparse solution stores no beam
@@ -138,8 +134,8 @@ def sparse_fit(
         return None
     base = problem.near(found.fit.causes).base
     orbits = None if blur is None else blur.of(found.fit.causes)
-    return _result(replace(begin(data, split), undetermined=orbits), base, found, count, most,
-                   judgement)  # fmt: skip
+    start = replace(design, undetermined=orbits)
+    return _result(start, base, found, count, judgement)
 
 
 def outperforms(fit: HierarchicalFit, sparse: SparseFit, judgement: Judgement) -> bool:
@@ -293,7 +289,6 @@ def _result(
     base: Predicted,
     found: Explanation,
     count: int,
-    most: int,
     judgement: Judgement,
 ) -> SparseFit:
     found = finished(found)
@@ -315,4 +310,4 @@ def _result(
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
     noise = expected and fit.p_value >= judgement.noise[0]
-    return SparseFit(fit, findings[:most], verdict, fitted_causes, covariance, messages, noise)
+    return SparseFit(fit, findings, verdict, fitted_causes, covariance, messages, noise)

@@ -11,13 +11,14 @@ from weakref import ref
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags, rms
+from tmlattice.arrays import Array, Flags, Reals, rms
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.effects import Hypothesis, find
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
-from tmlattice.observe.orbit_response import Errors, Predicted, bent
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
@@ -62,12 +63,13 @@ class Candidate:
 
 
 class Kept(NamedTuple):
-    """Derivatives of the readings by a variable of the ring, and where they were computed."""
+    """Derivatives of the readings by a variable of the ring, with the `Family.causes`, and with
+    the gains and scales of the columns."""
 
-    rows: Array  # [number, column, monitor]
+    rows: Reals  # [number, column, monitor]
+    causes: tuple[Hypothesis, ...]
     gain: Array  # [column, monitor]
     scale: Array  # [column]
-    at: Mapping[str, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +85,9 @@ class State:
         families: that are fitted.
         values: of the numbers, by variable.
         groups: the families' priors with learnt scales, by name.
-        kept: derivatives by the ring's variables, used until the ring has moved; latest: other
-            results, and the state of each. Caches that all states of a fit share.
+        kept: of each block the ring and the derivatives there by the ring's variables, used until
+            the ring has moved; latest: other results, and the state of each. Caches that all states
+            of a fit share.
         share: factors on the weights, less for outliers, [block, column, monitor].
         robust: whether outliers among the correctors' readings have less weight, too.
         apart: detected single faults.
@@ -108,7 +111,7 @@ class State:
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
-    kept: dict[str, Kept] = field(default_factory=dict)
+    kept: dict[int, tuple[Mapping[str, Array], dict[str, Kept]]] = field(default_factory=dict)
     latest: dict[Hashable, tuple[Any, Any]] = field(default_factory=dict)
     robust: bool = False
     apart: tuple[Candidate, ...] = ()
@@ -160,7 +163,7 @@ class State:
 
 def begin(data: ResponseData, split: Split) -> State:
     """The state of the design, with the third order of the steps."""
-    at = bent(Predicted(data, Errors.none(data)))
+    at = Predicted(data, Errors.none(data), data.bent)
     gap = data.pick(at.left)[~split.held]
     size = float(chi2.typical(gap))
     return State(
@@ -170,8 +173,11 @@ def begin(data: ResponseData, split: Split) -> State:
 
 
 def bend(state: State) -> State:
-    """The state with the third order of the steps."""
-    return replace(state, at=bent(state.at))
+    """The state with the third order of the steps, if the ring stores a beam with each."""
+    try:
+        return replace(state, at=state.at.bend())
+    except UnstableRingError:
+        return state
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
@@ -207,7 +213,7 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
         The change of the number, and the mean square residuals of far readings, in units of the
             noise, without and with it, [column]; NaN for held-out columns.
     """
-    rows = family.rows(state.at, np.zeros(0))
+    rows = np.asarray(family.rows(state.at, np.zeros(0)), dtype=float)
     left = state.data.pick(state.at.left, family.block)
     noise = state.data.noise_of(family.block)
     bent = state.data.pick(np.broadcast_to(state.at.bent, state.data.orbits.shape), family.block)

@@ -45,8 +45,7 @@ class Stated(NamedTuple):
 
 def unwidened(posterior: Posterior) -> Stated:
     """Posterior errors without widening."""
-    prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
-    return Stated(posterior.sigma, prior, posterior.whole)
+    return Stated(posterior.sigma, posterior.before, posterior.whole)
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
@@ -65,8 +64,7 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
     # mean square about the stated numbers, beyond the posterior's
     off = np.diag(tails.covariance) + (tails.mean - posterior.values) ** 2
     square += np.maximum(off - posterior.sigma**2, 0.0)
-    prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
-    return Stated(np.sqrt(square), prior, tails.covariance)
+    return Stated(np.sqrt(square), posterior.before, tails.covariance)
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
@@ -244,7 +242,7 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
     columns, monitors = state.data.shape
     m = 2 * monitors
     spread = posterior.spread
-    factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(len(spread.T)))
+    factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(spread.shape[1]))
     draws = spread @ factor
     scale = draws[:m].mean(axis=0)
     kick = draws[m : m + columns - 1].mean(axis=0)

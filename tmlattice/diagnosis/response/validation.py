@@ -14,7 +14,7 @@ free.
 >>> [(block.name, block.ratio) for block in remainder(state)]
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -82,14 +82,18 @@ def held_out(state: State) -> tuple[Indices, Flags, Flags]:
     return columns, seen[columns] & half[columns], seen[columns] & ~half[columns]
 
 
-def score(state: State, effect: str, parameters: int = 0) -> Step:
+def score(
+    state: State, effect: str, parameters: int = 0, moved: Mapping[int, Array] | None = None
+) -> Step:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
         state: to validate on its held-out correctors.
         effect, parameters: of the step.
+        moved: further changes of the predicted readings by block, m, [column, monitor].
     """
     data, at, half = state.data, state.at, state.split.half
+    more = [(moved or {}).get(block, np.zeros(data.shape)) for block in (0, 1)]
     orbits = data.pick(data.orbits)
     columns, near, far = held_out(state)
 
@@ -97,7 +101,7 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
         return data.pick(readings, block)[columns]
 
     read = at.seen(at.beam)
-    straight = picked(read)
+    straight = picked(read) + more[0][columns]
     # equal weights: model discrepancy does not scale with the noise
     (kick,), left = amplitudes(straight[..., None], orbits[columns], near)
     inside = np.where(far, left, np.nan)
@@ -105,7 +109,7 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
     spread = 1 + straight**2 / np.sum(straight**2, axis=1, where=near, keepdims=True)
     patterns = np.stack([straight, picked(at.seen(at.jumps))], axis=2)
     jumped = np.where(far, amplitudes(patterns, orbits[columns], near)[1], np.nan)
-    left = picked(data.orbits, 1) - kick[:, None] * picked(read, 1)
+    left = picked(data.orbits, 1) - kick[:, None] * (picked(read, 1) + more[1][columns])
     near, far = near & np.isfinite(left), far & np.isfinite(left)
     outside = np.where(far, left, np.nan)
     rolled = np.full_like(outside, np.nan)
@@ -113,7 +117,7 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
         rolls = picked(at.seen(at.across), 1)
         known = far & np.any(near & (rolls != 0), axis=1, keepdims=True)
         rolled = np.where(known, amplitudes(rolls[..., None], left, near)[1], np.nan)
-    of_rf = without_jitter(state, 0, data.pick(at.left))[0][-1]
+    of_rf = without_jitter(state, 0, data.pick(at.left) - more[0])[0][-1]
     of_rf = np.where(state.good & ~half[-1], of_rf, np.nan)
     noise = [data.noise_of(block) for block in (0, 1)]
     squares = (inside / noise[0][columns]) ** 2

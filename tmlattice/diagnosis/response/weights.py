@@ -42,7 +42,7 @@ def weight(state: State, block: int) -> Array:
 
 def taken(state: State, block: int) -> Array | None:
     """Return the factor of the information that beam jitter takes from the weights, see
-    `inference.common`, [column, monitor, pattern]; None without jitter."""
+    `inference.normal.common`, [column, monitor, pattern]; None without jitter."""
     return None if state.jitter is None else _common(state, block)[0]
 
 

@@ -1,5 +1,0 @@
-"""`python -m tmlattice.cli`."""
-
-from tmlattice.cli.command import main
-
-main()
