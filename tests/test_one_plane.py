@@ -92,3 +92,13 @@ def test_what_passes_an_unknown_orbit_on_has_no_amount(small_ring):
         (m.effect, m.element) == (cause.effect, cause.element)
         for finding in known.findings for m in finding.credible_set
     )  # fmt: skip
+
+
+def test_bpms_of_one_plane_that_alternate_are_validated_in_both_planes(small_ring):
+    cause = Cause("quadrupole_gradient", "QD::5", -0.2)
+    data = simulate(small_ring, [cause], shots=6, seed=1).measurement()
+    readings = data.readings.copy()
+    readings[:, :, ::2, 1] = readings[:, :, 1::2, 0] = np.nan
+    gap = diagnose(small_ring, replace(data, readings=readings)).heldout
+    assert np.isfinite(gap.residuals[-1]).any(axis=0).sum(axis=0).min() >= 6
+    assert gap.explained > 0.99

@@ -184,7 +184,7 @@ def held_out(
             if turns and small is not None and i:
                 explained = found.fit if stage.causes or not found.fit.causes else found.before
                 errors, known = _unknown(small, explained, there, stage)
-            groups, residual = predicted(there.with_fixed(causes), errors, known)
+            groups, residual = predicted(there.with_fixed(causes).near(()), errors, known)
             scored += groups
             left.append(residual)
         models.append(scored)

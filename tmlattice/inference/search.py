@@ -260,7 +260,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         state, scans = _scan_all(search, state)
         first = first or scans
         full = state.count >= search.most
-        over = full or len(state.outliers) > state.problem.judgement.most_outliers
+        over = full or len(state.outliers) >= state.problem.judgement.most_outliers
         options = [] if over else _options(search, state, scans)
         beyond = next((option.alternatives for option in options if option.kind == "named"), ())
         # the false-alarm rate decides on a first finding, the evidence on further ones

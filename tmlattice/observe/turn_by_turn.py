@@ -15,12 +15,13 @@ whatever the number of shots.
 Amplitude dependence of betatron lines: shifts of tunes and of ratios between monitors. Sextupoles
 and octupoles shift the tunes by the square of the amplitude; so does the longer path of an
 oscillation where cavities hold the energy. The phases between monitors, and with them the lines,
-shift by as much. The design is tracked from the measured amplitudes, and its turns are analysed by
-the same `lines` as the measured ones. The shift is the difference from a small oscillation. It has
-a part by the action of each mode, which may compensate one another; each has an error of its own.
-Its next order, in the fourth power of the amplitude, is the shift less twice that at half the
-action: a pattern around the ring with an unknown share. (As independent errors of the monitors a
-family of quadrupoles explained it, in a ring whose cells repeat.)
+shift by as much. The ring, the design until a cause is found, is tracked from the measured
+amplitudes, and its turns are analysed by the same `lines` as the measured ones. The shift is the
+difference from a small oscillation. It has a part by the action of each mode, which may compensate
+one another; each has an error of its own. Its next order, in the fourth power of the amplitude, is
+the shift less twice that at half the action: a pattern around the ring with an unknown share. (As
+independent errors of the monitors a family of quadrupoles explained it, in a ring whose cells
+repeat.)
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,8 +34,8 @@ from numpy.typing import NDArray
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import Hypothesis, find
-from tmlattice.errors import MeasurementError, first_of
+from tmlattice.effects import Cause, Hypothesis, find
+from tmlattice.errors import MeasurementError, UnstableRingError, first_of
 from tmlattice.inference.problem import Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
@@ -123,8 +124,8 @@ def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -
     """Return the shift of measured lines.
 
     Args:
-        ring: the design.
-        beams: stored beam of each shot.
+        ring: the design, for its monitors.
+        beams: stored beam of each shot, in the ring with its causes.
         found: the measured lines.
         at: s / C of each monitor.
     """
@@ -174,7 +175,7 @@ def _faded(found: Lines) -> Array:
 def _tracked(
     ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
 ) -> tuple[ComplexArray, Array, Array, Flags]:
-    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
+    """Lines of the ring over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
     mode], and whether the beam survived [shot], for about these amplitudes [shot, mode], of which
     the last is small."""
     layers = beam.model.turn
@@ -336,7 +337,8 @@ class ManyTurns(Stored):
     with the turns until the beam has decohered. A few simulated particles have a mean energy too.
 
     Attributes:
-        shift: by the amplitude of each shot.
+        shift: by the amplitude of each shot, of the ring at the causes of the last `near`.
+        lines: the measured lines, by which the ring is tracked for the shift; None: no shift.
         chromatic: change of tunes and modes by the energy and by its square, in units of the
             spread, [shot, order, mode] and [shot, order, monitor, 2, mode].
         warnings: a sentence for all data that could not be used.
@@ -344,8 +346,21 @@ class ManyTurns(Stored):
 
     counts: ClassVar[bool] = True
     shift: Shift = field(repr=False)
+    lines: Lines | None = field(repr=False)
     chromatic: tuple[Array, ComplexArray] = field(repr=False)
     warnings: tuple[str, ...] = ()
+
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with the shifts by amplitude at these causes, if the ring stores a
+        beam there."""
+        if self.lines is None or not (self.fixed or causes):
+            return self
+        try:
+            beams = self.view((*self.fixed, *causes)).beams
+        except UnstableRingError:
+            return self
+        at = np.array([monitor.s for monitor in self.ring.monitors]) / self.ring.length
+        return replace(self, shift=shift_of(self.ring, beams, self.lines, at))
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return alternatives: of a monitor's error its turn offset; of others the RF, where the
@@ -544,6 +559,7 @@ def many_turns(
         places=places,
         cache=cache,
         shift=shift,
+        lines=found if shifted and spectrum is None else None,
         chromatic=(of_tunes, of_modes),
         warnings=(*found.warnings, *large),
     )
