@@ -701,6 +701,14 @@ CHANGES = (
         lasts=True,
         fewer=("corrector_kick_y", "quadrupole_offset_x", "dipole_field", "monitor_gain_x"),
     ),
+    row("orbit, since: another energy", Cause("energy_offset", None, 1e-3)),
+    row(
+        "orbit, since: another energy, as before, and a kick",
+        Cause("energy_offset", None, 2e-3),
+        Cause("corrector_kick_x", "v6", 3e-5),
+        before=(Cause("energy_offset", None, 2e-3),),
+        found=(Cause("corrector_kick_x", "v6", 3e-5),),
+    ),
 )
 
 TURNS = (
@@ -775,6 +783,10 @@ TURNS = (
     ),
     row("orbit: a kick", Cause("corrector_kick_x", "v6", 3e-5)),
     row("orbit: nothing", verdicts=NOTHING),
+    row("orbit: another energy", Cause("energy_offset", None, 1e-3)),
+    row("orbit, usual errors: another energy", Cause("energy_offset", None, 2e-3)),
+    row("turns: another energy", Cause("energy_offset", None, 2e-3)),
+    row("orbit, dispersion, tunes: another energy", Cause("energy_offset", None, -1e-3)),
     row("dispersion: a magnet", Cause("quadrupole_gradient", "QD::3", -0.01)),
     row("orbit, dispersion, tunes: nothing", verdicts=NOTHING),
     row(

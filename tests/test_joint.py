@@ -80,7 +80,8 @@ def test_each_sees_its_part_and_both_are_named(small_ring):
 
 
 def test_the_energy_of_a_launch_and_that_of_a_stored_beam_are_two(small_ring):
-    whole = {"orbit": _orbit(small_ring, [KICK]), "turns": _turns(small_ring, [])}
+    launched = simulate(small_ring, shots=2, seed=2).measurement()
+    whole = {"orbit": _orbit(small_ring, [KICK]), "injection": launched}
     with pytest.raises(EffectError, match="none of these effects can be looked for here"):
         diagnose(small_ring, whole, effects=["energy_offset"])
 

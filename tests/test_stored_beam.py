@@ -54,6 +54,7 @@ def _hypotheses(ring):
         if isinstance(effect, RingEffect) and effect.power == 1:
             places = effect.places(ring)
             yield from ((name, place) for place in places[:: max(len(places) // 2, 1)][:2])
+    yield "energy_offset", None
 
 
 @pytest.mark.parametrize("rf_is_felt", [False, True])
@@ -70,8 +71,13 @@ def test_every_effect_vs_differences(small_ring, with_cavities, rf_is_felt):
     for i, (name, place) in enumerate(hypotheses):
         step = 1e-4 * find(name).largest
         up, down = (
-            StoredBeam(ResponseModel(apply(ring, [Cause(name, place, side * step)])), felt)
-            for side in (1, -1)
+            StoredBeam(
+                beam.model.at_energy(change)
+                if name == "energy_offset"
+                else ResponseModel(apply(ring, [Cause(name, place, change)])),
+                felt,
+            )
+            for change in (step, -step)
         )
         orbit = (up.model.readings - down.model.readings) / (2 * step)
         tunes = (up.tunes - down.tunes) / (2 * step)

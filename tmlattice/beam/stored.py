@@ -29,7 +29,7 @@ from tmlattice.arrays import Array, ComplexArray, Indices
 from tmlattice.beam.closed_orbit import ResponseModel, feed_down
 from tmlattice.beam.response_derivatives import STILL, kicks_on_orbit
 from tmlattice.beam.rf import NO_RF, Cavities
-from tmlattice.effects import Hypothesis
+from tmlattice.effects import Hypothesis, RingEffect, find
 from tmlattice.effects.directions import directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
@@ -110,16 +110,22 @@ class StoredBeam:
         """Return the derivatives by effects on the ring.
 
         Args:
-            hypotheses: (effect, place), of effects on the ring.
+            hypotheses: (effect, place), of effects on the ring, or of the beam's energy.
             oscillates: whether tunes and modes are read; else theirs are 0.
         """
         model, count = self.model, len(hypotheses)
+        on_ring = np.array([isinstance(find(name), RingEffect) for name, _ in hypotheses], bool)
         monitors = len(model.maps.at)
         moved = Moved(
             np.zeros((count, monitors, 2)), np.zeros((count, 2)),
             np.zeros((count, monitors, 2, 2), dtype=complex),
         )  # fmt: skip
-        d = directions_nearby(model.layers, hypotheses)
+        if not on_ring.all():
+            one = self._by_energy(oscillates)
+            moved.orbit[~on_ring], moved.tunes[~on_ring] = one.orbit, one.tunes
+            moved.modes[~on_ring] = one.modes
+        where = np.flatnonzero(on_ring)
+        d = directions_nearby(model.layers, [hypotheses[i] for i in where.tolist()])
         if len(d.owner):
             w, slopes = kicks_on_orbit(model, d)
             found: list[tuple[Any, Any]] = [(moved.orbit, self._orbit(d.layer, w))]
@@ -132,16 +138,27 @@ class StoredBeam:
                 found += [(moved.tunes, tunes), (moved.modes, seen)]
             for out, rows in found:
                 if len(np.unique(d.owner)) == len(rows):
-                    out[d.owner] = rows
+                    out[where[d.owner]] = rows
                 else:  # families have one row per member
-                    np.add.at(out, d.owner, rows)
-        for row, (owner, m) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
+                    np.add.at(out, where[d.owner], rows)
+        for row, (owner, m) in enumerate(zip(where[d.read_owner], d.monitor, strict=True)):
             at = model.maps.at[m]
             x = model.path[at]
             bent = second_derivatives(d.E2[row][None])[0] @ x
             moved.orbit[owner, m] += d.E0[row] + (d.E1[row] + bent / 2) @ x
             moved.modes[owner, m] += (d.E1[row] + bent) @ self._C[at] @ self._U
         return moved
+
+    def _by_energy(self, oscillates: bool) -> Moved:
+        """Orbit, tunes and modes by the relative energy that the RF frequency gives the beam."""
+        model, n = self.model, self.model.dimension
+        z = model.rf_start / model.rf_start[5]
+        orbit = model.reading_slopes @ z
+        if not oscillates:
+            return Moved(orbit, np.zeros(2), np.zeros_like(self.modes))
+        tunes, mixed = self._perturbed((self._bends[-1].reshape(-1, n) @ z).reshape(1, n, n))
+        through = (z @ self._seen_bends).view(complex).reshape(self.modes.shape)
+        return Moved(orbit, tunes[0], through + self._G @ mixed[0])
 
     def _orbit(self, k: Indices, w: Array) -> Array:
         """The closed orbit's change at the monitors, [row, monitor, 2], by kicks w in layers k, as

@@ -18,10 +18,11 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
 from tmlattice.diagnosis.recommended_actions import compensated
 from tmlattice.diagnosis.records import named
-from tmlattice.effects import Cause, Hypothesis, RingEffect, changed_elements, find
+from tmlattice.effects import Cause, Hypothesis, LaunchEffect, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import TaylorMap
+from tmlattice.observe.calibration import offset_of
 from tmlattice.optics import normal_modes
 
 Pair = tuple[float, float]
@@ -75,25 +76,26 @@ class StoredOptics:
 def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Consequences]:
     """The effect of each cause on the stored beam, by effect and element.
 
-    Those of monitors, of the beam itself and of what acts on settings alone do not change the
-    stored beam of the design's settings, and have no entry; nor have natural effects.
+    Those of monitors and of what acts on settings alone do not change the stored beam of the
+    design's settings, and have no entry; nor have natural effects.
 
     Args:
         ring: the design.
-        causes: all that were found.
+        causes: all that were found; of the beam's, those of a stored one.
     """
-    felt = [cause for cause in causes if _felt(cause.effect)]
+    felt = [c for c in causes if _felt(c.effect) or isinstance(find(c.effect), LaunchEffect)]
     if not felt:
         return {}
     there = assembly(ring)
     design = _optics(there, {})
-    found = _optics(there, _changed(ring, ring, causes))
+    found = _optics(there, _changed(ring, ring, causes), offset_of(causes))
     each: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
         corrected, by_hand = compensated(ring, [cause])
         changed = _changed(ring, corrected, others if by_hand else causes)
-        each[cause.effect, cause.element] = _compared(design, found, _optics(there, changed))
+        after = _optics(there, changed, offset_of(others if by_hand else causes))
+        each[cause.effect, cause.element] = _compared(design, found, after)
     return each
 
 
@@ -131,8 +133,11 @@ def _changed(ring: Ring, corrected: Ring, causes: Sequence[Cause]) -> dict[int, 
     return settings | changed_elements(corrected, causes)
 
 
-def _optics(there: Assembly, changed: Mapping[int, Element]) -> StoredOptics | None:
-    """The optics of the ring with these elements; None where it has no stable closed orbit."""
+def _optics(
+    there: Assembly, changed: Mapping[int, Element], energy: float = 0.0
+) -> StoredOptics | None:
+    """The optics of the ring with these elements, at the closed orbit of this relative energy; None
+    where it has no stable one."""
     layers = Layers.of(there.maps)
     layers.put(there.layers_with(changed))
     W0, W1, W2 = layers.W
@@ -140,7 +145,7 @@ def _optics(there: Assembly, changed: Mapping[int, Element]) -> StoredOptics | N
         there.maps, W0=W0[:-1], W1=W1[:-1], W2=W2[:-1], closing=TaylorMap([w[-1] for w in layers.W])
     )
     try:
-        path, total = Chain(maps).closed_orbit()
+        path, total = Chain(maps).closed_orbit([0.0, 0.0, 0.0, 0.0, 0.0, energy])
         turn = total[-1]
         values, modes = normal_modes(turn[:4, :4])
     except (TmlatticeError, np.linalg.LinAlgError):

@@ -60,6 +60,7 @@ from tmlattice.inference.search import Explanation, Search
 from tmlattice.inference.validation import Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import AnyMeasurement
+from tmlattice.observe.calibration import offset_of
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
 from tmlattice.speaks import listed, micrometres
@@ -93,7 +94,7 @@ def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) ->
         chosen = list(parts[0].problem.places)
         options = replace(options, places=parts[0].problem.places)
     else:
-        chosen = _chosen(ring, effects, "turn_by_turn" in kinds)
+        chosen = _chosen(ring, effects, kinds)
         places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
         options = replace(given, places=places, reference=None, effects=None)
         parts = [
@@ -150,17 +151,21 @@ def _seen(ring: Ring, effects: Sequence[str], parts: Sequence[Part]) -> list[Hyp
     ]  # fmt: skip
 
 
-def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
-    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
-    chosen = [name for name in chosen if not _of_launches(find(name))]
+def _chosen(ring: Ring, effects: Sequence[str] | None, kinds: Sequence[str]) -> list[str]:
+    chosen = modelled(effects, "turn_by_turn" in kinds)
+    chosen = [name for name in chosen if find(name).places(ring)]
+    chosen = [name for name in chosen if not _of_launches(find(name), "trajectory" in kinds)]
     if not chosen:
         raise EffectError("none of these effects can be looked for here; name another one")
     return chosen
 
 
-def _of_launches(effect: Effect) -> bool:
-    """Whether a hypothesis is of launches alone, which a stored beam or free launches absorb."""
-    return isinstance(effect, LaunchEffect) and (effect.shifts is not None or not effect.responds)
+def _of_launches(effect: Effect, launched: bool) -> bool:
+    """Whether a hypothesis is of launches; the energy of a launch and that of a stored beam are
+    two, and launches have an energy of their own."""
+    if not isinstance(effect, LaunchEffect):
+        return False
+    return not effect.responds or (launched and effect.shifts is not None)
 
 
 # --- results ----
@@ -206,6 +211,8 @@ def _report(
     views = views_of(parts, kept, stages)
     since = 0 if small is None else max(len(stages) - 2, 0)
     turns = parts[0] if parts[0].hypotheses is not None and len(parts) == 1 else None
+    # what acts on a stored beam: launches have an energy of their own
+    stored = [c for c in causes if turns is None or not isinstance(find(c.effect), LaunchEffect)]
     rejected: tuple[dict[str, Any], ...] = ()
     heldout = held_out(parts, kept, found, small, stages, since)
     if turns is None:
@@ -256,7 +263,7 @@ def _report(
             replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one))
             if turns is None
             else one
-            for one in with_consequences(ring, findings, causes)
+            for one in with_consequences(ring, findings, stored)
         ),
         fit_before=misfit(stages[0 if small is None else 1]),
         fit_after=misfit(stages[-1]),
@@ -271,7 +278,7 @@ def _report(
             combined_p_value(compared),
             judgement,
         ),
-        tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected)},
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected, offset_of(stored))},
         next=_next(found, parts, options, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),

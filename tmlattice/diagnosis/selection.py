@@ -17,6 +17,7 @@ from tmlattice.effects import Cause, Hypothesis, LaunchEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import leading
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import (
     MAX_ELEMENTS,
     DistributedErrors,
@@ -29,6 +30,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Problem
 from tmlattice.inference.search import Explanation, Search, explain, revised
+from tmlattice.observe.first_turns import FirstTurns
 
 STEPS = 4
 """Linearisations of the distributed errors at new findings, at most; two are usual."""
@@ -140,20 +142,22 @@ def select_changes(
     search.progress("reference")
     before = replace(before, most=Search.most)
     alone = select(before, everywhere, sizes, learn=learn, noisy=noisy)
-    common = _of_ring(alone.explanation.fit.causes)
+    assert isinstance(search.problem, CombinedProblem)
+    launched = any(isinstance(part, FirstTurns) for part in search.problem.parts)
+    common = _of_machine(alone.explanation.fit.causes, launched)
     for _ in range(Search.most):
         own = replace(search, problem=search.problem.with_fixed(common))
         found = select(own, everywhere, sizes, learn=learn, noisy=noisy, reference=alone)
-        more = _of_ring(_in_both(found.explanation))
+        more = _of_machine(_in_both(found.explanation), launched)
         if not more:
             break
         common = (*common, *more)
     return found
 
 
-def _of_ring(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """Without the launches' own, which are fitted in each measurement anyway."""
-    return tuple(c for c in causes if not isinstance(find(c.effect), LaunchEffect))
+def _of_machine(causes: Sequence[Cause], launched: bool) -> tuple[Cause, ...]:
+    """Without those of launches, which differ from one measurement to the next."""
+    return tuple(c for c in causes if not (launched and isinstance(find(c.effect), LaunchEffect)))
 
 
 def _in_both(explanation: Explanation) -> tuple[Cause, ...]:

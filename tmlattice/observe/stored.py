@@ -43,10 +43,10 @@ from tmlattice.inference.problem import (
     Problem,
     Products,
     effects_on_readings,
-    effects_on_ring,
 )
 from tmlattice.inference.whitening import Projection
 from tmlattice.lattice import Ring
+from tmlattice.observe.calibration import offset_of
 
 NOTHING = np.zeros(0)
 """Nuisances of a kind without any."""
@@ -257,9 +257,11 @@ class ModelCache:
                 if at == state:
                     return beam
                 near = beam
-        model = self._model(ring, settings, causes) if near is None else near.model
-        if model.frequency != frequency:
-            model = model.at_frequency(frequency)
+        energy = offset_of(causes)
+        model = near.model if near and not energy else self._model(ring, settings, causes)
+        of_beam = frequency + (energy / float(model.rf_start[5]) if energy else 0.0)
+        if model.frequency != of_beam:
+            model = model.at_frequency(of_beam)
         made = StoredBeam(model, cavities_of(ring, model) if feels_rf else NO_RF)
         self._beams.append((key, state, causes, made))
         return made
@@ -354,9 +356,12 @@ class Stored(Steady):
 
     # --- the model ------------------------------------------------------------------------------
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """Whether a stored beam shows the cause: no launch, and turn offsets in turns alone."""
+        """Whether a stored beam shows the cause: of the launch the energy, which the RF's frequency
+        determines, and turn offsets in turns alone."""
         effect = find(hypothesis[0])
-        return not isinstance(effect, LaunchEffect) and (self.counts or not effect.of_turns)
+        if isinstance(effect, LaunchEffect):
+            return effect.shifts is not None
+        return self.counts or not effect.of_turns
 
     def view(self, causes: Sequence[Cause]) -> Beams:
         """Return the stored beam of each state."""
@@ -377,11 +382,11 @@ class Stored(Steady):
         return self.readings_of([seen_by(one, matrix, constant) for one in shown], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Signatures: effects on the ring in closed form, those on monitors by differences."""
+        """Signatures: effects on the beam in closed form, those on monitors by differences."""
         out = np.zeros((len(hypotheses), *self.used.shape))
-        on_ring = effects_on_ring(hypotheses)
-        if len(on_ring):
-            some = [hypotheses[i] for i in on_ring]
+        of_beam = np.flatnonzero([not isinstance(find(h[0]), ReadingEffect) for h in hypotheses])
+        if len(of_beam):
+            some = [hypotheses[i] for i in of_beam.tolist()]
             matrix = view.monitors.matrix()
             known: dict[int, Moved] = {}
             for beam in view.beams:
@@ -390,7 +395,7 @@ class Stored(Steady):
             moved = self.with_turn_offsets(
                 [known[id(beam)] for beam in view.beams], view.monitors.late
             )
-            out[on_ring] = self.readings_of(moved, nuisances)
+            out[of_beam] = self.readings_of(moved, nuisances)
         for effect, which, at in effects_on_readings(hypotheses, self.monitors):
             changed = self.of_monitors(view, nuisances, effect)
             for i, monitor in zip(which, at, strict=True):
