@@ -244,3 +244,17 @@ def test_what_is_known_is_written_beside_the_lattice(small_ring, tmp_path):
     document["seen"]["float32"] = "AAAA"
     file.write_text(json.dumps(document).replace("nowhere", small_ring.monitors[0].name))
     tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=2)
+
+
+def test_what_both_days_have_is_in_the_model_of_each(small_ring):
+    """An energy and a strong kick in both, of which neither day's readings keep a residual."""
+    both = [Cause("energy_offset", None, 2e-3), Cause("corrector_kick_y", "v2", 1e-4)]
+    before, after = (
+        simulate_orbits(small_ring, causes, shots=6, noise=NOISE, seed=seed).measured
+        for seed, causes in enumerate((both, [*both, KICK]))
+    )
+    result = diagnose(small_ring, after, reference=before)
+    assert _found(result) == {(KICK.effect, KICK.element)}
+    assert result.fit_after.chi2_per_dof == pytest.approx(1.0, abs=0.2)
+    assert result.heldout.misfits[-1].chi2_per_dof < 1.5
+    assert result.heldout.explained > 0.99

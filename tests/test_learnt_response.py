@@ -134,3 +134,12 @@ def test_a_learnt_response_may_step_some_correctors(small_ring, tmp_path, monkey
     monkeypatch.setattr(sys.modules["tmlattice.challenge.make"], "measure", lost)
     make("B", 1, folder=tmp_path / "lost", learnt=True, progress=False, **some)
     assert read_case(tmp_path / "lost", "0000").learnt is None
+
+
+def test_the_energy_of_a_beam_is_not_kept_with_the_estimated_ring(small_ring):
+    energy = [Cause("energy_offset", None, 1e-3)]
+    first = simulate(small_ring, energy, background=USUAL, machine_seed=SEED, shots=6, seed=1)
+    injected = diagnose(small_ring, first.measurement())
+    assert "energy_offset" in {cause.effect for cause in injected.causes}
+    assert not {c.effect for c in known_of(injected).causes} & {"energy_offset"}
+    assert not {c.effect for c in injected.calibration} & {"energy_offset"}

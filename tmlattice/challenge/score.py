@@ -159,7 +159,7 @@ def row_of(
         "seconds": result.get("seconds"),
         "explained": result["gap"]["explained"],
         "heldout_chi2_per_dof": _after(result),
-        "heldout_as_noise": _as_noise(result, len(places.monitors) // 2),
+        "heldout_as_noise": _as_noise(result),
         "stated": stated(result, causes),
         "class": _class(result),
         "refused": _refused(result),
@@ -223,12 +223,12 @@ def _after(result: Mapping[str, Any]) -> float | None:
     return None if heldout is None else heldout["after"]["chi2_per_dof"]
 
 
-def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
-    """Whether the held-out misfit of the scored monitors is within its 99 % interval."""
+def _as_noise(result: Mapping[str, Any]) -> bool | None:
+    """Whether the held-out misfit of the scored readings is within its 99 % interval."""
     left = _after(result)
     if left is None or not np.isfinite(left) or not result["gap"]["heldout"]["shots"]:
         return None
-    freedom = 2 * monitors * len(result["gap"]["heldout"]["shots"])
+    freedom = result["gap"]["heldout"]["readings"]
     low, high = stats.chi2.interval(0.99, freedom)
     return bool(low <= left * freedom <= high)
 

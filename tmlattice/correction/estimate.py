@@ -15,7 +15,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
-from tmlattice.effects import Cause, Hypothesis, apply, changes_beam
+from tmlattice.effects import Cause, Hypothesis, apply, changes_beam, is_energy
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.newton import STEP_SHARES
@@ -122,10 +122,10 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
     """
     known = known or known_of(diagnosis) or _each_alone(diagnosis)
     found = Estimate(diagnosis.as_found, diagnosis.ring, known)
-    if not diagnosis.by_families or diagnosis.since_reference:
+    if diagnosis.kind == "trajectory" or diagnosis.since_reference:
         return found  # in first turns the energy is the injected beam's
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
-    energies = [(c.amount, s) for c, s in pairs if c.effect == "energy_offset"]
+    energies = [(c.amount, s) for c, s in pairs if is_energy(c.effect)]
     return found.with_beam(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
 
 

@@ -18,7 +18,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
 from tmlattice.diagnosis.recommended_actions import compensated
 from tmlattice.diagnosis.records import named
-from tmlattice.effects import Cause, Hypothesis, LaunchEffect, RingEffect, changed_elements, find
+from tmlattice.effects import Cause, Hypothesis, RingEffect, changed_elements, find, is_energy
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import TaylorMap
@@ -83,7 +83,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
         ring: the design.
         causes: all that were found; of the beam's, those of a stored one.
     """
-    felt = [c for c in causes if _felt(c.effect) or isinstance(find(c.effect), LaunchEffect)]
+    felt = [c for c in causes if _felt(c.effect) or is_energy(c.effect)]
     if not felt:
         return {}
     there = assembly(ring)

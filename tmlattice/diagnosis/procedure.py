@@ -48,6 +48,7 @@ from tmlattice.effects import (
     apply,
     background_rms,
     find,
+    is_energy,
     modelled,
     rare,
 )
@@ -91,10 +92,10 @@ def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) ->
         parts = [part_of(label, one, options)]
         before = [one.reference for one in parts if one.reference is not None]
         hypotheses = list(parts[0].hypotheses or ())
-        chosen = list(parts[0].problem.places)
+        chosen, of_reference = list(parts[0].problem.places), modelled()
         options = replace(options, places=parts[0].problem.places)
     else:
-        chosen = _chosen(ring, effects, kinds)
+        chosen, of_reference = (_chosen(ring, own, kinds) for own in (effects, None))
         places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
         options = replace(given, places=places, reference=None, effects=None)
         parts = [
@@ -105,7 +106,8 @@ def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) ->
         hypotheses = _seen(ring, chosen, parts)
     problem = replace(
         stacked(parts, before, options), rare=rare(ring, chosen),
-        fixed=() if known is None else known.causes,
+        # a beam has an energy of its own, and launches another one
+        fixed=tuple(c for c in known.causes if not is_energy(c.effect)) if known else (),
     )  # fmt: skip
     search = Search(
         problem, hypotheses, given.max_effects, seed=given.seed, progress=given.progress,
@@ -123,8 +125,9 @@ def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) ->
         selected = select(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
     else:
         first = problem.reference
-        earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
+        earlier = replace(search, problem=first, hypotheses=_seen(ring, of_reference, parts))
         selected = select_changes(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
+        problem = problem.with_fixed(selected.common)
     small = selected.distributed
     if noisy and problem.alone and small is not None:  # with the noise that was learnt
         assert isinstance(small.plain, CombinedProblem)
@@ -165,7 +168,7 @@ def _of_launches(effect: Effect, launched: bool) -> bool:
     two, and launches have an energy of their own."""
     if not isinstance(effect, LaunchEffect):
         return False
-    return not effect.responds or (launched and effect.shifts is not None)
+    return not effect.responds or (launched and is_energy(effect.name))
 
 
 # --- results ----

@@ -14,7 +14,7 @@ from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, named, of, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import PartView, ResponseView, TrajectoryView
-from tmlattice.effects import Cause, Settings, apply
+from tmlattice.effects import Cause, Settings, apply, is_energy
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
@@ -416,6 +416,8 @@ class Diagnosis(Speaks):
         """Gains and calibrations, for `write_calibration`."""
         bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
         own = [c for c in self.causes if c.effect in CALIBRATES]
+        if self.kind == "trajectory":  # whose energy is that of the launches
+            own = [c for c in own if not is_energy(c.effect)]
         # a hierarchical fit is of readings with swapped planes corrected
         swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
                  if f.effect == "monitor_swap" and self.by_families)  # fmt: skip

@@ -43,10 +43,12 @@ class Selection:
     Attributes:
         explanation: of the search.
         distributed: errors in the model; None: there are none.
+        common: causes in the measurement and in its reference.
     """
 
     explanation: Explanation
     distributed: FittedErrors | None = None
+    common: tuple[Cause, ...] = ()
 
 
 def select(
@@ -152,7 +154,7 @@ def select_changes(
         if not more:
             break
         common = (*common, *more)
-    return found
+    return replace(found, common=common)
 
 
 def _of_machine(causes: Sequence[Cause], launched: bool) -> tuple[Cause, ...]:

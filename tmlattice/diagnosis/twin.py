@@ -67,7 +67,7 @@ def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
         if not isinstance(found.problem, DistributedProblem):
             return None
         known = found.problem.learnt(found.fit if causes else found.before)
-        beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
+        beside = tuple(c for c in diagnosis.faults if _held_by_ring(c))
         return replace(known, causes=(*known.causes, *beside))
     view = diagnosis.response
     if not diagnosis.steps or diagnosis.since_reference:
@@ -141,7 +141,7 @@ def _each_alone(
 
 
 def _held_by_ring(cause: Cause) -> bool:
-    """Whether an error is kept with the estimated ring; first turns have energies of their own."""
+    """Whether an error is kept with the estimated ring; a beam has an energy of its own."""
     return not _in_ring(cause) and not isinstance(find(cause.effect), LaunchEffect)
 
 

@@ -425,6 +425,10 @@ class ReadingEffect(Effect):
         return (up.matrix() - down.matrix()) / (high - low), constant / (high - low)
 
 
+ENERGY = 5
+"""Index of the energy among the coordinates of a launch."""
+
+
 class LaunchEffect(Effect):
     """An effect on the beam at its start.
 
@@ -499,6 +503,12 @@ def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[s
         chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
     effects = [CATALOGUE[name] for name in names(chosen)]
     return [one.name for one in effects if one.modelled and (turns or not one.of_turns)]
+
+
+def is_energy(name: str) -> bool:
+    """Whether an effect is the mean energy of a beam: of a launch, or of the stored beam."""
+    effect = find(name)
+    return isinstance(effect, LaunchEffect) and effect.shifts == ENERGY
 
 
 def changes_beam(name: str) -> bool:

@@ -228,7 +228,14 @@ class MarginalProblem(Problem):
 
     def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with further fixed causes and the same errors."""
-        other = replace(self, inner=self.inner.with_fixed(causes))
+        return self._around(self.inner.with_fixed(causes))
+
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem near these causes, and the same errors."""
+        return self._around(self.inner.near(causes))
+
+    def _around(self, inner: Problem) -> Self:
+        other = replace(self, inner=inner)
         vars(other)["_root"] = self._root
         return other
 

@@ -271,7 +271,10 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         if not options and not pending:
             break
         if not options:
-            state, pending = revised(search, state), False
+            names, pending = state.names, False
+            state = revised(search, state)
+            if state.names != names:
+                search, state = _near(search, state)
             continue
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
@@ -281,8 +284,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
             state = there
             break
         if best.kind == "named":
-            search = replace(search, problem=search.problem.near(state.fit.causes))
-            state = _without(search, state, state.dropped)
+            search, state = _near(search, state)
         pending = pending or state.count > 1
         if state.count > 1 and best.kind != "reading":
             state = revised(search, state, quick=True)
@@ -296,6 +298,12 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         **vars(state), before=before, first=first.named, first_kicks=first.kicks,
         scan=scans.named, left=scans.kicks, full=full, beyond=beyond,
     )  # fmt: skip
+
+
+def _near(search: Search, state: AnyState) -> tuple[Search, AnyState]:
+    """The search and its state with the model near the present causes."""
+    search = replace(search, problem=search.problem.near(state.fit.causes))
+    return search, _without(search, state, state.dropped)
 
 
 def _weighed(search: Search, one: State, other: State) -> float:

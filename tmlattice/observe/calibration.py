@@ -9,7 +9,7 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import CORRECTORS, Columns, ResponseModel
 from tmlattice.beam.kicks import by_energy
-from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
+from tmlattice.effects import CATALOGUE, Cause, apply, check, find, is_energy, monitors_with
 from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
@@ -139,7 +139,7 @@ def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) 
 
 def offset_of(causes: Iterable[Cause]) -> float:
     """Relative deviation of the beam's mean energy."""
-    return sum(cause.amount for cause in causes if cause.effect == "energy_offset")
+    return sum(cause.amount for cause in causes if is_energy(cause.effect))
 
 
 def calibrated_response(

@@ -31,6 +31,7 @@ from tmlattice.effects import (
     Settings,
     apply,
     find,
+    is_energy,
     monitors_with,
 )
 from tmlattice.effects.effect import MIN_STRENGTH
@@ -251,18 +252,20 @@ class ModelCache:
         Raises:
             UnstableRingError: no stored beam.
         """
-        key, near, state = repr(settings), None, (frequency, feels_rf)
+        key, state = repr(settings), (frequency, feels_rf)
+        near: tuple[ResponseModel, float] | None = None
         for own, at, known, beam in self._beams:
             if own == key and known == causes:
                 if at == state:
                     return beam
-                near = beam
-        energy = offset_of(causes)
-        model = near.model if near and not energy else self._model(ring, settings, causes)
-        of_beam = frequency + (energy / float(model.rf_start[5]) if energy else 0.0)
+                near = beam.model, frequency + beam.model.frequency - at[0]
+        if near is None:
+            model, energy = self._model(ring, settings, causes), offset_of(causes)
+            near = model, frequency + (energy / float(model.rf_start[5]) if energy else 0.0)
+        model, of_beam = near
         if model.frequency != of_beam:
             model = model.at_frequency(of_beam)
-        made = StoredBeam(model, cavities_of(ring, model) if feels_rf else NO_RF)
+        made = StoredBeam(model, cavities_of(ring, model, frequency) if feels_rf else NO_RF)
         self._beams.append((key, state, causes, made))
         return made
 
@@ -280,18 +283,22 @@ class ModelCache:
         return base.changed_to(apply(base.ring, rest)) if rest else base
 
 
-def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
+def cavities_of(ring: Ring, model: ResponseModel, frequency: float | None = None) -> Cavities:
     """Return the RF that acts on turns of a stored beam.
 
     Args:
         ring: the design.
         model: of the ring with its errors.
+        frequency: relative change that was set; None: the model's. The rest of the model's is an
+            energy of the beam, which turns no RF on.
 
     Raises:
         UnstableRingError: the RF cannot replace the energy loss.
     """
     rf = ring.memory.setdefault("rf", rf_of(ring))
     loss = sum(element.errors.loss for element in model.ring.elements)
+    if not rf.on(loss, model.frequency if frequency is None else frequency):
+        return NO_RF
     try:
         return cavities(ring, rf, model.layers.layer_of, loss, model.frequency)
     except LatticeError as error:
@@ -360,7 +367,7 @@ class Stored(Steady):
         determines, and turn offsets in turns alone."""
         effect = find(hypothesis[0])
         if isinstance(effect, LaunchEffect):
-            return effect.shifts is not None
+            return is_energy(effect.name)
         return self.counts or not effect.of_turns
 
     def view(self, causes: Sequence[Cause]) -> Beams:

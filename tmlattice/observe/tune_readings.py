@@ -66,8 +66,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     slopes = np.full((shots, 2), np.nan)
     if measured.chromaticity is not None:
         slopes = measured.chromaticity
-        up, down = (StoredBeam(ResponseModel(ring, 6, h)).tunes for h in (step, -step))
-        own = short_way(up - down) / energies
+        own = _chromaticity(ring)
         most = LARGEST * (1 + np.abs(own) + (ring_tunes(ring) or [0.0, 0.0]))
         for shot, plane in np.argwhere(np.abs(slopes - own) > most)[:1]:
             raise MeasurementError(
@@ -79,7 +78,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
         [_filled(measured.tune_error, TUNE, shots),
          _filled(measured.chromaticity_error, CHROMATICITY, shots)], axis=1
     )  # fmt: skip
-    errors[:, 2:] = np.hypot(errors[:, 2:], fringe_uncertainty(ring))
+    errors[:, 2:] = np.hypot(errors[:, 2:], chromaticity_uncertainty(ring))
     there = np.isfinite(data)
     return TuneReadings(
         ring=ring,
@@ -93,25 +92,45 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     )
 
 
-def fringe_uncertainty(ring: Ring) -> Array:
-    """Return the uncertainty of the model's chromaticities by fringe fields, [mode].
+def chromaticity_uncertainty(ring: Ring) -> Array:
+    """Return the uncertainty of the model's chromaticities by the field of bends, [mode].
 
-    The extent of a bend's fringe field (gap g, field integral K, curvature h) changes the vertical
+    The extent of a fringe field (gap g, field integral K, curvature h) changes the vertical
     focusing of an edge by K g h^2. By the equations of motion that share falls with the momentum.
     The second-order maps, as MAD-X, keep it, and in AT's exact bends it rises with the momentum.
     The chromaticities differ by dQ / d ln g, all gaps together.
 
+    A gradient k1 that is constant across a curved bend, or across its straight poles, differs by
+    the sextupole h k1. Second-order maps and AT's exact bends differ by as much.
+
     Raises:
-        UnstableRingError: the ring, or the ring with other gaps, stores no beam.
+        UnstableRingError: the ring, or the ring with other bends, stores no beam.
     """
-    bends = {i: e for i, e in enumerate(ring.elements) if e.kind == "bend" and e.source.gap}
-    if not bends:
-        return np.zeros(2)
-    wider = {i: e.changed(gap=(1 + WIDER) * e.source.gap) for i, e in bends.items()}
-    before, after = (
-        StoredBeam(ResponseModel(own)).tunes for own in (ring, ring.with_elements(wider))
-    )
-    return short_way(after - before) / WIDER
+    bends = {i: e for i, e in enumerate(ring.elements) if e.kind == "bend"}
+    wider = {i: e.changed(gap=(1 + WIDER) * e.source.gap) for i, e in bends.items() if e.source.gap}
+    curved = {
+        i: e.changed(k2=e.k2 + e.angle / e.length * e.k1)
+        for i, e in bends.items() if e.k1 and e.length
+    }  # fmt: skip
+    found = np.zeros(2)
+    if wider:
+        before, after = (
+            StoredBeam(ResponseModel(own)).tunes for own in (ring, ring.with_elements(wider))
+        )
+        found = short_way(after - before) / WIDER
+    if curved:
+        before, after = (_chromaticity(own) for own in (ring, ring.with_elements(curved)))
+        found = np.hypot(found, after - before)
+    return np.abs(found)
+
+
+def _chromaticity(ring: Ring) -> Array:
+    """Change of the tunes by the relative deviation of the momentum, [mode]."""
+    model = ResponseModel.of(ring)
+    step = DELTA / float(model.rf_start[5])
+    up, down = (StoredBeam(ResponseModel(ring, 6, h)).tunes for h in (step, -step))
+    # p is the deviation of the energy over p0 c: beta times that of the momentum
+    return short_way(up - down) * ring.beta / (2 * DELTA)
 
 
 def _filled(errors: Array | None, usual: float, shots: int) -> Array:

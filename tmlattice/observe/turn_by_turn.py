@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import Cause, Hypothesis, find
+from tmlattice.effects import Cause, Hypothesis, ReadingEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError, first_of
 from tmlattice.inference.problem import Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
@@ -339,6 +339,7 @@ class ManyTurns(Stored):
     Attributes:
         shift: by the amplitude of each shot, of the ring at the causes of the last `near`.
         lines: the measured lines, by which the ring is tracked for the shift; None: no shift.
+        shifts: the latest of `near`, by its causes.
         chromatic: change of tunes and modes by the energy and by its square, in units of the
             spread, [shot, order, mode] and [shot, order, monitor, 2, mode].
         warnings: a sentence for all data that could not be used.
@@ -347,20 +348,30 @@ class ManyTurns(Stored):
     counts: ClassVar[bool] = True
     shift: Shift = field(repr=False)
     lines: Lines | None = field(repr=False)
+    shifts: dict[tuple[Cause, ...], Shift] = field(default_factory=dict, repr=False, compare=False)
     chromatic: tuple[Array, ComplexArray] = field(repr=False)
     warnings: tuple[str, ...] = ()
 
     def near(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with the shifts by amplitude at these causes, if the ring stores a
-        beam there."""
-        if self.lines is None or not (self.fixed or causes):
+        beam there; those of a shot whose amplitude is too large there stay."""
+        there = tuple(c for c in (*self.fixed, *causes)
+                      if not isinstance(find(c.effect), ReadingEffect))  # fmt: skip
+        if self.lines is None or not there:
             return self
-        try:
-            beams = self.view((*self.fixed, *causes)).beams
-        except UnstableRingError:
-            return self
-        at = np.array([monitor.s for monitor in self.ring.monitors]) / self.ring.length
-        return replace(self, shift=shift_of(self.ring, beams, self.lines, at))
+        if there not in self.shifts:
+            try:
+                beams = self.view(there).beams
+            except UnstableRingError:
+                return self
+            at = np.array([monitor.s for monitor in self.ring.monitors]) / self.ring.length
+            self.shifts.clear()
+            self.shifts[there] = shift_of(self.ring, beams, self.lines, at)
+        new = self.shifts[there]
+        kept = new.too_large & ~self.shift.too_large
+        modes, tunes = new.modes.copy(), new.tunes.copy()
+        modes[kept], tunes[kept] = self.shift.modes[kept], self.shift.tunes[kept]
+        return replace(self, shift=replace(self.shift, modes=modes, tunes=tunes))
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return alternatives: of a monitor's error its turn offset; of others the RF, where the
