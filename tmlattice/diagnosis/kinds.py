@@ -157,11 +157,11 @@ def _response(label: str, kind: str, measured: Any, options: Options) -> Part:
     split = split_columns(data, min(options.holdout, HELD), np.random.default_rng(options.seed))
     held = np.append(split.held[:-1], False)[:, None]
     # half of a held-out corrector's BPMs is fitted, to determine its own kick
-    fitted, judges = (
+    fitted, heldout = (
         replace(whole, used=whole.used & which[:, :, None])
         for which in (~held | split.half, held & ~split.half)
     )
-    return Part(label, kind, fitted, judges, messages=messages)
+    return Part(label, kind, fitted, heldout, messages=messages)
 
 
 def _problem(data: ResponseData, options: Options) -> Response:
@@ -189,8 +189,8 @@ def _of_stored(
         problem = make(options.ring, measured, options.places)
         messages = data_checks(options.ring, measured, problem=problem)
         messages += problem.warnings if isinstance(problem, ManyTurns) else ()
-        judges = held and make(options.ring, held, options.places)
-        return Part(label, kind, problem, judges, messages=tuple(messages))
+        heldout = held and make(options.ring, held, options.places)
+        return Part(label, kind, problem, heldout, messages=tuple(messages))
 
     return made
 

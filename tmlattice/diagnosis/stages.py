@@ -162,25 +162,25 @@ def held_out(
         stages: the models.
         since: index of the model with which the last one is compared.
     """
-    judges = []
+    heldout = []
     for part, fitted in zip(parts, problem.parts, strict=False):
-        if (judge := part.heldout) is not None:
-            never = ~np.asarray(fitted.valid.any(axis=0))[: judge.valid.shape[1]]
-            unused = np.zeros(judge.valid.shape, dtype=bool)
+        if (unseen := part.heldout) is not None:
+            never = ~np.asarray(fitted.valid.any(axis=0))[: unseen.valid.shape[1]]
+            unused = np.zeros(unseen.valid.shape, dtype=bool)
             unused[:, : len(never)] = never
-            judges.append(judge.without(unused))
-    if not judges:
+            heldout.append(unseen.without(unused))
+    if not heldout:
         return None
-    turns = len(parts) == 1 and isinstance(judges[0], FirstTurns)
+    turns = len(parts) == 1 and isinstance(heldout[0], FirstTurns)
     models, residuals = list[list[Residuals]](), list[Array]()
     for i, stage in enumerate(stages):
         scored, left = list[Residuals](), list[Array]()
-        for judge in judges:
+        for unseen in heldout:
             fixed, causes = (
-                [cause for cause in some if judge.sees((cause.effect, cause.element))]
+                [cause for cause in some if unseen.sees((cause.effect, cause.element))]
                 for some in ((*problem.fixed, *stage.static), stage.causes)
             )
-            there, errors, known = judge.with_fixed(fixed), None, 0
+            there, errors, known = unseen.with_fixed(fixed), None, 0
             if turns and small is not None and i:
                 explained = found.fit if stage.causes or not found.fit.causes else found.before
                 errors, known = _unknown(small, explained, there, stage)
