@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.command import tmlattice
-from tmlattice import Cause, diagnose, simulate, write_measurement
+from tmlattice import Cause, correct, diagnose, simulate, write_measurement
 from tmlattice.effects import apply, background_rms
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.lattice import save_ring
@@ -21,7 +21,7 @@ from tmlattice.machine.stored_beam import (
 )
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import ClosedOrbit
-from tmlattice.optics import matrix_tunes
+from tmlattice.optics import matrix_tunes, ring_tunes
 
 KICK = Cause("corrector_kick_x", "v6", 3e-5)
 WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)
@@ -258,3 +258,11 @@ def test_what_both_days_have_is_in_the_model_of_each(small_ring):
     assert result.fit_after.chi2_per_dof == pytest.approx(1.0, abs=0.2)
     assert result.heldout.misfits[-1].chi2_per_dof < 1.5
     assert result.heldout.explained > 0.99
+
+
+def test_an_energy_is_matched_by_the_rf_and_not_by_magnets(small_ring):
+    energy = Cause("energy_offset", None, 1e-3)
+    result = diagnose(small_ring, _orbit(small_ring, [energy]))
+    assert _found(result) == {("energy_offset", None)}
+    assert result.tunes["after"] == pytest.approx(ring_tunes(small_ring, energy.amount), abs=1e-4)
+    assert correct(result).settings == ()

@@ -122,8 +122,8 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
     """
     known = known or known_of(diagnosis) or _each_alone(diagnosis)
     found = Estimate(diagnosis.as_found, diagnosis.ring, known)
-    if diagnosis.kind == "trajectory" or diagnosis.since_reference:
-        return found  # in first turns the energy is the injected beam's
+    if not diagnosis.by_families or diagnosis.since_reference:
+        return found  # an energy that is a finding is matched by the RF, or the injector
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
     energies = [(c.amount, s) for c, s in pairs if is_energy(c.effect)]
     return found.with_beam(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))

@@ -416,7 +416,9 @@ class Diagnosis(Speaks):
         """Gains and calibrations, for `write_calibration`."""
         bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
         own = [c for c in self.causes if c.effect in CALIBRATES]
-        if self.kind == "trajectory":  # whose energy is that of the launches
+        if (
+            not self.by_families
+        ):  # an energy that is a finding is matched by the RF, or the injector
             own = [c for c in own if not is_energy(c.effect)]
         # a hierarchical fit is of readings with swapped planes corrected
         swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
