@@ -140,7 +140,8 @@ class CombinedProblem(Problem):
         for part, active in zip(self.parts, self.active, strict=True):
             there = (*self.fixed, *(causes if active else ()))
             parts.append(part.near([c for c in there if part.sees((c.effect, c.element))]))
-        return replace(self, parts=tuple(parts))
+        same = all(own is part for own, part in zip(parts, self.parts, strict=True))
+        return self if same else replace(self, parts=tuple(parts))
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point; its `view` are the points of the parts."""

@@ -232,7 +232,8 @@ class MarginalProblem(Problem):
 
     def near(self, causes: Sequence[Cause]) -> Self:
         """Return the problem near these causes, and the same errors."""
-        return self._around(self.inner.near(causes))
+        inner = self.inner.near(causes)
+        return self if inner is self.inner else self._around(inner)
 
     def _around(self, inner: Problem) -> Self:
         other = replace(self, inner=inner)
