@@ -2,12 +2,14 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
+import machine_data
 import numpy as np
 import pytest
 from shared import valid
 
-from tmlattice import diagnose
+from tmlattice import diagnose, load_ring
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
@@ -45,6 +47,13 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
     assert found.kind == kind
     assert found.status != "wrong", [check.sentence for check in found.reported]
     valid(found.as_json(), "check")
+
+
+def test_tunes_of_usual_errors_that_resemble_the_other_plane_are_not_swapped():
+    """Qx = 0.157 and Qy = 0.228, where usual errors move each by 0.03: these did by 0.07 and 0.06."""
+    soleil = load_ring(Path(machine_data.__file__).parent / "soleil.m")
+    read = TuneReading(tune=np.array([[0.2273, 0.1728]]))
+    assert check_data(soleil, read).status != "wrong"
 
 
 CHANGES = {

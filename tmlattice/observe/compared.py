@@ -82,10 +82,12 @@ class Compared(Search):
     Attributes:
         what: a column.
         least: columns that an assumption must change, at least.
+        usual: misfit that usual errors leave.
     """
 
     what: ClassVar[str]
     least: ClassVar[int] = 1
+    usual: ClassVar[float] = USUAL**2
 
     @property
     def of(self) -> str:
@@ -125,7 +127,7 @@ class Compared(Search):
         found = []
         for names in self.candidates():
             other, of_rf = self.misfit(names), names[0].startswith("rf")
-            change = np.log((other + USUAL**2) / (stated + USUAL**2))
+            change = np.log((other + self.usual) / (stated + self.usual))
             moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
             few = moved.sum() < (1 if of_rf else self.least)
             if few or (change[moved] < 0).mean() < SHARE:
@@ -487,6 +489,7 @@ class OfTunes(Compared):
     """Tunes of all shots, against the design's."""
 
     what: ClassVar[str] = "tune"
+    usual: ClassVar[float] = 1 / 9
 
     @cached_property
     def design(self) -> Array:
