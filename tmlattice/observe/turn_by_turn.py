@@ -35,7 +35,7 @@ from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import Cause, Hypothesis, ReadingEffect, find
-from tmlattice.errors import MeasurementError, UnstableRingError, first_of
+from tmlattice.errors import MeasurementError, TooFewTurnsError, UnstableRingError, first_of
 from tmlattice.inference.problem import Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
@@ -354,19 +354,19 @@ class ManyTurns(Stored):
 
     def near(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with the shifts by amplitude at these causes, if the ring stores a
-        beam there; those of a shot whose amplitude is too large there stay."""
+        beam of these amplitudes there; those of a shot whose amplitude is too large there stay."""
         there = tuple(c for c in (*self.fixed, *causes)
                       if not isinstance(find(c.effect), ReadingEffect))  # fmt: skip
         if self.lines is None or not there:
             return self
         if there not in self.shifts:
-            try:
-                beams = self.view(there).beams
-            except UnstableRingError:
-                return self
             at = np.array([monitor.s for monitor in self.ring.monitors]) / self.ring.length
+            try:
+                new = shift_of(self.ring, self.view(there).beams, self.lines, at)
+            except (UnstableRingError, TooFewTurnsError):
+                return self
             self.shifts.clear()
-            self.shifts[there] = shift_of(self.ring, beams, self.lines, at)
+            self.shifts[there] = new
         new = self.shifts[there]
         kept = new.too_large & ~self.shift.too_large
         modes, tunes = new.modes.copy(), new.tunes.copy()
