@@ -50,7 +50,7 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
 
 
 def test_tunes_of_usual_errors_that_resemble_the_other_plane_are_not_swapped():
-    """Qx = 0.157 and Qy = 0.228, where usual errors move each by 0.03: these did by 0.07 and 0.06."""
+    """Qx = 0.157 and Qy = 0.228, where usual errors move each by 0.03; here by 0.07 and 0.06."""
     soleil = load_ring(Path(machine_data.__file__).parent / "soleil.m")
     read = TuneReading(tune=np.array([[0.2273, 0.1728]]))
     assert check_data(soleil, read).status != "wrong"
