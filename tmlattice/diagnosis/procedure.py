@@ -106,8 +106,7 @@ def diagnose_together(measured: Mapping[str, AnyMeasurement], given: Options) ->
         hypotheses = _seen(ring, chosen, parts)
     problem = replace(
         stacked(parts, before, options), rare=rare(ring, chosen),
-        # a beam has an energy of its own, and launches another one
-        fixed=tuple(c for c in known.causes if not is_energy(c.effect)) if known else (),
+        fixed=() if known is None else known.causes,
     )  # fmt: skip
     search = Search(
         problem, hypotheses, given.max_effects, seed=given.seed, progress=given.progress,
@@ -166,9 +165,8 @@ def _chosen(ring: Ring, effects: Sequence[str] | None, kinds: Sequence[str]) -> 
 def _of_launches(effect: Effect, launched: bool) -> bool:
     """Whether a hypothesis is of launches; the energy of a launch and that of a stored beam are
     two, and launches have an energy of their own."""
-    if not isinstance(effect, LaunchEffect):
-        return False
-    return not effect.responds or (launched and is_energy(effect.name))
+    shared = effect.responds and not (launched and is_energy(effect.name))
+    return isinstance(effect, LaunchEffect) and not shared
 
 
 # --- results ----
